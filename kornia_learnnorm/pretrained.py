@@ -192,7 +192,7 @@ def find_part(name: str, own_modules: Collection[str], *modules: Any) -> Any:
     module, _, attribute = name.rpartition(".")
     if not module:
         raise ValueError(f"unknown part {name!r}")
-    if module not in own_modules:
+    if module not in ([own_modules] if isinstance(own_modules, str) else own_modules):
         how = f"import it by own_modules=[{module!r}], on the command line by {module}:FILE"
         raise ValueError(f"{name} is not of this package; if you trust the module, {how}")
     with working_folder_importable():

@@ -71,20 +71,20 @@ class EpipolarLoss(nn.Module):
 
         ValueError if ``heldout_weight`` is positive and there are no held-out correspondences.
         """
-        own = self._residuals(points1, points2, F_mat).mean(-1)
+        own = _distances(self.residual, points1, points2, F_mat, self.ceiling).mean(-1)
         loss = (own + self.floor).log().mean() if self.log else own.mean()
         if self.heldout_weight == 0:
             return loss.to(F_mat.dtype)
         if heldout1 is None or heldout2 is None or heldout1.shape[-2] == 0:
             raise ValueError(f"heldout_weight={self.heldout_weight} needs held-out correspondences, got none")
-        rest = self._residuals(heldout1, heldout2, F_mat)
+        rest = _distances(self.residual, heldout1, heldout2, F_mat, self.ceiling)
         heldout = (rest + self.heldout_floor).log().mean() if self.log else rest.mean()
         return ((1 - self.heldout_weight) * loss + self.heldout_weight * heldout).to(F_mat.dtype)
 
-    def _residuals(self, points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
-        # In float64: next to an epipole, the square of a line's normal leaves the range of float32.
-        dtype = solve_dtype(F_mat.device)
-        return self.residual(points1.to(dtype), points2.to(dtype), F_mat.to(dtype)).clamp(max=self.ceiling)
+
+def _distances(residual: Residual, points1: Tensor, points2: Tensor, M: Tensor, most: float = MAX_DISTANCE) -> Tensor:
+    # In float64: next to an epipole, the square of a line's normal leaves the range of float32.
+    return residual(*(value.to(solve_dtype(M.device)) for value in (points1, points2, M))).clamp(max=most)
 
 
 class BoundedEpipolarLoss(nn.Module):
@@ -111,8 +111,8 @@ class BoundedEpipolarLoss(nn.Module):
 
     def forward(self, points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
         """Return the loss of each set, (B,), of matches (B, M, 2) x 2 under matrices (B, 3, 3)."""
-        squared = self.residual(points1, points2, F_mat).clamp(max=MAX_DISTANCE).square()
-        return (squared / (squared + self.scale**2)).mean(-1)
+        squared = _distances(self.residual, points1, points2, F_mat).square()
+        return (squared / (squared + self.scale**2)).mean(-1).to(F_mat.dtype)
 
 
 class LogEpipolarLoss(nn.Module):
@@ -136,7 +136,7 @@ class LogEpipolarLoss(nn.Module):
 
     def forward(self, points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
         """Return the loss of each set, (B,), of correspondences (B, M, 2) x 2 under matrices (B, 3, 3)."""
-        return (self.residual(points1, points2, F_mat).clamp(max=MAX_DISTANCE) + self.floor).log().mean(-1)
+        return (_distances(self.residual, points1, points2, F_mat) + self.floor).log().mean(-1).to(F_mat.dtype)
 
 
 class LogEssentialLoss(nn.Module):

@@ -125,6 +125,9 @@ class TestLossesOfSets:
         (gradient,) = torch.autograd.grad(value.sum(), on_epipole)
         assert value.isfinite().all()
         assert not gradient.any()
+        near = torch.tensor([[[1e-22, 0.0]]], requires_grad=True)
+        loss(near, torch.tensor([[[5.0, 1.0]]]), torch.tensor([[[0.0, -1, 0], [1, 0, 0], [0, 0, 0]]])).sum().backward()
+        assert near.grad.isfinite().all()
 
     def test_log_essential(self):
         E_mat, true = uniform(4, 3, 3, low=-1), uniform(4, 3, 3, low=-1, seed=1)

@@ -1,1 +1,1 @@
-"""From correspondences to fundamental matrices: linear, refined, minimal."""
+"""From correspondences to matrices: linear and learned layers, their stages, refinement."""

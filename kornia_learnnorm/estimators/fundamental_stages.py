@@ -53,13 +53,9 @@ class FundamentalRefinement(Refinement):
         state = Rank2(best.axes + 0.0 * M[:, None], best.A)
         power = probability.clamp(min=torch.finfo(M.dtype).tiny) ** LAST_POWER
         power = power if self.weights is None else power * self.weights
-
-        def square_scale(squares: Tensor) -> Tensor:
-            """Return a scale that moves along, so that derivatives don't depend on where the fit began."""
-            return FIT_SCALE**2 * mean(squares) + LAST_FLOOR**2
-
-        fit_steps = max(1, steps - SEARCH_STEPS)
-        fitted: Tensor = descend(evidence, state, power[:, None], square_scale, fit_steps, RELAXATION).matrix()
+        # The scale moves along, so that derivatives don't depend on where the fit began.
+        options = (lambda s: FIT_SCALE**2 * mean(s) + LAST_FLOOR**2), max(1, steps - SEARCH_STEPS), RELAXATION
+        fitted: Tensor = descend(evidence, state, power[:, None], *options).matrix()
         present = weights > 0
         few = (present.sum(1) < MIN_MATCHES) | ((probability * present).sum(1) < MIN_INLIERS)
         if is_known_true(~few.any()):

@@ -10,10 +10,7 @@ from torch import Tensor
 from kornia_learnnorm.estimators.fundamental_stages import FundamentalRefinement
 from kornia_learnnorm.estimators.learned_layer import LearnedLayer, StageEstimate, inlier_probability
 from kornia_learnnorm.estimators.linear import essential_matrix
-from kornia_learnnorm.estimators.network_features import CommonFrame
-from kornia_learnnorm.estimators.stages import Refinement
 from kornia_learnnorm.geometry.checks import check_cameras, check_whole_number
-from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.fundamental import Fundamental
 
 
@@ -90,6 +87,7 @@ class LearnedEightPoint(LearnedLayer):
     model_name = Fundamental.name
     architecture = ("width", "depth", "stages", "learn_transforms", "rank2", "refine_steps", "samples")
     added: ClassVar[dict[str, Any]] = {"samples": 64}
+    refinement = FundamentalRefinement
 
     def __init__(
         self,
@@ -104,9 +102,6 @@ class LearnedEightPoint(LearnedLayer):
         super().__init__(Fundamental(rank2), width, depth, stages, learn_transforms, refine_steps)
         check_whole_number("samples", samples, 0)
         self.rank2, self.samples = rank2, samples
-
-    def _refinement(self, problem: LinearProblem, frame: CommonFrame) -> Refinement:
-        return FundamentalRefinement(self.model, problem, frame, self.samples, not self.training)
 
     @classmethod
     def from_pretrained(cls, name: str | Path = "robust-synthetic") -> LearnedEightPoint:

@@ -12,7 +12,6 @@ from kornia_learnnorm.estimators.homography_stages import HomographyRefinement
 from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.estimators.learned_layer import LearnedLayer, inlier_probability
 from kornia_learnnorm.estimators.network_features import CommonFrame
-from kornia_learnnorm.estimators.stages import Refinement
 from kornia_learnnorm.geometry.checks import check_whole_number
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem
@@ -75,6 +74,7 @@ class LearnedHomography(LearnedLayer):
     model_name, takes_cameras = Homography.name, False
     architecture = ("width", "depth", "stages", "refine_steps", "samples")
     added: ClassVar[dict[str, Any]] = {"samples": 64}
+    refinement = HomographyRefinement
 
     def __init__(
         self, width: int = 48, depth: int = 4, stages: int = 2, refine_steps: int = 3, samples: int = 64
@@ -135,6 +135,3 @@ class LearnedHomography(LearnedLayer):
         ordered = LinearProblem.from_points(points1, points2, problem.weights, self.model)
         M, logits = super()._run(ordered, scores)
         return torch.where(swapped[..., None], unit_matrix(self.model.swap(M)), M), logits
-
-    def _refinement(self, problem: LinearProblem, frame: CommonFrame) -> Refinement:
-        return HomographyRefinement(self.model, problem, frame, self.samples, not self.training)

@@ -11,7 +11,7 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
 
 from kornia_learnnorm.estimators.fundamental_stages import SQUARE_FLOOR
-from kornia_learnnorm.estimators.linear import solve_undetermined
+from kornia_learnnorm.estimators.linear import solve_linear
 from kornia_learnnorm.estimators.matches import MatchLayer
 from kornia_learnnorm.estimators.network_features import POINT_FEATURES, RESIDUAL_FEATURES, CommonFrame
 from kornia_learnnorm.estimators.set_network import SetWeightingNetwork
@@ -55,6 +55,8 @@ class LearnedLayer(MatchLayer):
     # Arguments that files hold.
     architecture: tuple[str, ...] = ("width", "depth", "stages", "learn_transforms", "refine_steps")
     added: ClassVar[dict[str, Any]] = {}  # those that files of earlier versions lack
+    refinement: type[Refinement] = Refinement
+    samples = 0
 
     def __init__(
         self, model: TwoViewModel, width: int, depth: int, stages: int, learn_transforms: bool, refine_steps: int
@@ -140,7 +142,7 @@ class LearnedLayer(MatchLayer):
 
         def solve_rest(problem: LinearProblem) -> tuple[Tensor, ...]:
             number = self.stages if self.detach_stages else self.stages + 1
-            M, logits = solve_undetermined(problem, None), torch.zeros_like(problem.x1[..., 0])
+            M, logits = self.model.fallback(solve_linear(problem, None)), torch.zeros_like(problem.x1[..., 0])
             return M.expand(number, -1, -1, -1).transpose(0, 1), logits.expand(number, -1, -1).transpose(0, 1)
 
         M, logits = solve_where_determined(problem, solve, solve_rest)
@@ -148,11 +150,7 @@ class LearnedLayer(MatchLayer):
 
     def _run(self, problem: LinearProblem, scores: Tensor | None) -> tuple[Tensor, Tensor]:
         """Return matrices (B, S, 3, 3) and logits (B, S, N) of stages and final estimate, of determined sets."""
-        options = self.learn_transforms, self.refine_steps, self.detach_stages
-        return run_stages(self.model, self.networks, problem, scores, *options, self._refinement)
-
-    def _refinement(self, problem: LinearProblem, frame: CommonFrame) -> Refinement:
-        return Refinement(self.model, problem, frame)
+        return run_stages(self, problem, scores)
 
 
 def inlier_probability(

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.estimators.learned_layer import LearnedLayer, check_scores, inlier_probability
+from kornia_learnnorm.estimators.optimize import choose
 from kornia_learnnorm.estimators.pose_stages import (
     POSE_OUTPUTS,
     POSE_POINT_FEATURES,
@@ -21,7 +22,7 @@ from kornia_learnnorm.geometry.checks import check_cameras, check_whole_number, 
 from kornia_learnnorm.geometry.dlt import MIN_GAP
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.pose import choose_pose
-from kornia_learnnorm.geometry.problem import LinearProblem, generic_points, prepare_problem
+from kornia_learnnorm.geometry.problem import LinearProblem, prepare_problem
 from kornia_learnnorm.models.essential import Calibrated, Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 
@@ -196,30 +197,15 @@ class LearnedRelativePose(LearnedLayer):
         determined, gap = _determined(problem)
         solved, C1, C2, rows, eye = problem, K1, K2, determined[:, None], torch.eye(3).to(K1)
         if not is_known_true(determined.all()):
-            # No derivative meets an undetermined set: generic points take its place, and their result is dropped.
-            points = zip((problem.points1, problem.points2), generic_points(problem.points1), strict=True)
-            p1, p2 = (torch.where(rows[..., None], own, other) for own, other in points)
-            given = None if problem.weights is None else torch.where(rows, problem.weights, 1.0)
-            solved = LinearProblem.from_points(p1, p2, given, self.model)
+            solved = problem.with_generic_points(determined)  # the result of these is dropped
             C1, C2 = (torch.where(rows[..., None], K, eye) for K in (K1, K2))
-        settle = self.samples > 0 and not (self.training or self.detach_stages)
-        options = self.refine_steps, self.samples, self.detach_stages, settle
         with inference_mode():
-            pieces = [
-                run_pose_stages(self.networks, part, part_C1, part_C2, part_scores, *options)
-                for part, part_C1, part_C2, part_scores in in_pieces(solved, C1, C2, scores)
-            ]
+            pieces = [run_pose_stages(self, *piece) for piece in in_pieces(solved, C1, C2, scores)]
         all_states, all_logits = zip(*pieces, strict=True)
         states = [Calibrated(*map(torch.cat, zip(*stage, strict=True))) for stage in zip(*all_states, strict=True)]
         preferred = eye.new_tensor(self.model.preferred).view(1, 3, 3)
         sideways = Essential(eye[None], eye[None]).calibrated(preferred)
-        states = [
-            state._replace(
-                axes=torch.where(rows[..., None, None], state.axes, sideways.axes),
-                A=torch.where(rows[..., None], state.A, sideways.A),
-            )
-            for state in states
-        ]
+        states = [choose(determined, state, sideways) for state in states]
         logits = [torch.where(rows, torch.cat(stage), 0.0) for stage in zip(*all_logits, strict=True)]
         return problem, (K1, K2), determined, gap, states, logits
 

@@ -125,7 +125,7 @@ class LinearLayer(MatchLayer):
         return (solve_linear(problem, self.normalizer),)
 
     def _solve_undetermined(self, problem: LinearProblem) -> tuple[Tensor]:
-        return (solve_undetermined(problem, getattr(self.normalizer, "base", None)),)
+        return (problem.model.fallback(solve_linear(problem, getattr(self.normalizer, "base", None))),)
 
 
 def find_homography(
@@ -273,13 +273,6 @@ class EightPoint(LinearLayer):
             (F_mat,) = solve_where_determined(problem, self._solve, self._solve_undetermined)
         F_mat, gap = F_mat.to(points1.dtype, copy=not torch.is_grad_enabled()), problem.gap.clone()
         return TwoViewEstimate(F_mat, essential_matrix(F_mat, K1, K2), problem.determined, gap)
-
-
-@torch.no_grad()
-def solve_undetermined(problem: LinearProblem, normalizer: Normalizer | None) -> Tensor:
-    """Return matrices of the model for sets of correspondences that do not determine them, without gradient."""
-    M: Tensor = problem.model.fallback(solve_linear(problem, normalizer))
-    return M
 
 
 def essential_matrix(F_mat: Tensor, K1: Tensor | None, K2: Tensor | None) -> Tensor | None:

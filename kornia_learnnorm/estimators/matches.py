@@ -153,7 +153,8 @@ def _pairs_of_matches(keypoints1: Tensor, matches: Tensor, scores: Scores) -> tu
         expected = f"{[*keypoints1.shape[:2]]} or {[len(keypoints1), 'S', 2]}"
         raise ValueError(f"matches must have shape {expected} or be a list, got {[*matches.shape]}")
     if scores is not None and (not isinstance(scores, Tensor) or scores.shape != matches.shape[:2]):
-        raise ValueError(f"scores must have the shape of the matches, {[*matches.shape[:2]]}, got {_shape(scores)}")
+        got = [*scores.shape] if isinstance(scores, Tensor) else type(scores)
+        raise ValueError(f"scores must have the shape of the matches, {[*matches.shape[:2]]}, got {got}")
     if matches.is_floating_point() or matches.dtype == torch.bool:
         raise TypeError(f"matches must be tensors of integers, got {matches.dtype}")
     rows = [torch.nonzero((row >= 0).all(-1) if by_pair else row >= 0)[:, 0] for row in matches]
@@ -181,7 +182,3 @@ def _check_scores(k: int, scores: Tensor, number: int) -> None:
     if not bool((scores.detach() >= 0).all()) or not bool(scores.detach().isfinite().all()):
         low, high = scores.detach().aminmax()
         raise ValueError(f"scores of pair {k} must be finite and not negative, got {low:g} to {high:g}; no logits")
-
-
-def _shape(value: object) -> object:
-    return [*value.shape] if isinstance(value, Tensor) else type(value)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from kornia_learnnorm.estimators.optimize import choose
 from kornia_learnnorm.geometry.checks import safe_divisor
-from kornia_learnnorm.geometry.row_moments import normal_equations, point_products, row_moments, row_products
+from kornia_learnnorm.geometry.row_moments import ENTRIES, normal_equations, point_products, row_moments, row_products
 
 NORMAL_FLOOR = 1e-4  # of the norm of the matrix, added to that of each line's normal
 
@@ -161,9 +161,7 @@ def _normal_forms() -> Tensor:
     normals1 = torch.einsum("ab,pk,ql->pqakbl", flat, eye, eye)  # (F^T)_{1:2} x2
     forms = torch.stack([normals2, normals1]).view(2, 3, 3, 81)
     forms[:, 2, 2] += NORMAL_FLOOR**2 / 2 * torch.eye(9, dtype=torch.float64).flatten()  # the third coordinate is one
-    first, second = torch.triu_indices(3, 3)
-    both = forms[:, first, second] + forms[:, second, first]
-    return torch.where((first == second)[:, None], both / 2, both).flatten(0, 1)
+    return torch.einsum("vpqx,pqs->vsx", forms, ENTRIES).flatten(0, 1)
 
 
 _FORMS = _normal_forms()

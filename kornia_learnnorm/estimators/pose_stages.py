@@ -1,10 +1,11 @@
 r"""The stages of the learned relative pose: features, logits, moment matrix, essential matrices, robust steps."""
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
-from torch import Tensor, nn
+from torch import Tensor
 
 from kornia_learnnorm.estimators.camera_evidence import contradict_cameras, keeps_fit
 from kornia_learnnorm.estimators.cheirality import in_front_of_best_pose
@@ -48,21 +49,14 @@ Candidates = tuple[Tensor, Tensor]  # essential matrices (B, S, 3, 3), and which
 
 
 def run_pose_stages(
-    networks: nn.ModuleList,
-    problem: LinearProblem,
-    K1: Tensor,
-    K2: Tensor,
-    scores: Tensor | None,
-    refine_steps: int,
-    samples: int,
-    detach_stages: bool,
-    settle: bool,
+    layer: Any, problem: LinearProblem, K1: Tensor, K2: Tensor, scores: Tensor | None
 ) -> tuple[list[Calibrated], list[Tensor]]:
     """Return the states of the stages and their logits (B, N), for sets that determine their matrix.
 
-    With ``settle``, sets of few outliers leave out the stages between the first network and the last fit.
+    In evaluation, sets of few outliers leave out the stages between the first network and the last fit.
     """
-    present = problem.present
+    networks, detach_stages, present = layer.networks, layer.detach_stages, problem.present
+    settle = layer.samples > 0 and not (layer.training or detach_stages)
     frame = CommonFrame.from_points(problem.points1, problem.points2, present)
     x1, x2 = convert_points_to_homogeneous(torch.stack([frame.x1, frame.x2])).mT.contiguous()
     model = Essential.of_cameras(K1, K2, frame.T, frame.T)
@@ -98,18 +92,21 @@ def run_pose_stages(
         found.append(logits)
         if len(found) == len(networks) or is_known_true(settled.all()):
             break
-        with torch.no_grad():
-            state = _likeliest(evidence, model, unit, weights, suggested, before)
+        with torch.no_grad():  # the states of least weighted cost among those that the weights suggest
+            spans = _moment_spans(evidence, model, suggested[:, None])
+            E_mat, real = _suggested(spans, _in_spans(spans), before)
+            losses = _losses(evidence, model, E_mat, EARLY_PIXELS / unit)
+            state = model.calibrated(least_cost(E_mat, real, losses, weights, 1)[:, 0])
         state = model.attach(state)
         square_scale = _square_scale(weights, early * scale, unit, near)
         states.append(descend(evidence, state, weights[:, None], square_scale, EARLY_STEPS, RELAXATION))
-    drawn = 0 if detach_stages else samples
+    drawn = 0 if detach_stages else layer.samples
     with torch.no_grad():
         state, front = _most_consistent(evidence, model, unit, weights, suggested, before, drawn, settled)
     state = model.attach(state)
     share = torch.where(front & (weights > 0), weights.clamp(min=tiny) ** LAST_POWER, 0.0)
     scale = torch.where(settled[:, None], SETTLED_SCALE, last * scale)
-    options = _square_scale(weights, scale, unit, near), refine_steps, RELAXATION
+    options = _square_scale(weights, scale, unit, near), layer.refine_steps, RELAXATION
     state = descend(evidence, state, share[:, None], *options)
     if not detach_stages:
         state = _leave_cameras(evidence, model, state, share, unit, *options)
@@ -134,16 +131,6 @@ def _losses(evidence: Evidence, model: Essential, E_mat: Tensor, scale: Tensor) 
     return evidence.single().losses(F_mat.float(), scale.square()[:, None])
 
 
-def _likeliest(
-    evidence: Evidence, model: Essential, unit: Tensor, weights: Tensor, suggested: Tensor, before: Candidates | None
-) -> Calibrated:
-    """Return the states of least weighted cost among those that the weights suggest."""
-    spans = _moment_spans(evidence, model, suggested[:, None])
-    E_mat, real = _suggested(spans, _in_spans(spans), before)
-    losses = _losses(evidence, model, E_mat, EARLY_PIXELS / unit)
-    return model.calibrated(least_cost(E_mat, real, losses, weights, 1)[:, 0])
-
-
 def _most_consistent(
     evidence: Evidence,
     model: Essential,
@@ -164,7 +151,9 @@ def _most_consistent(
     order = weights.argsort(dim=1, descending=True, stable=True)
     few = (samples + 1) // 2  # are enough for a settled set
     samples = few if is_known_true(settled.all()) else samples
-    drawn, used = _sample_spans(evidence, model, weights, order, samples)
+    drawn, used = sample_null_spaces(evidence, weights, order, samples, Essential.sample_size)
+    inverse1, inverse2 = (torch.linalg.inv_ex(C)[0][:, None, None] for C in (model.C1, model.C2))
+    drawn = inverse2.mT @ drawn @ inverse1
     used = used & (~settled[:, None] | (torch.arange(samples, device=settled.device) < few))
     spans = _moment_spans(evidence, model, torch.stack([suggested, present], 1))
     found, real = _in_spans(torch.cat([spans, drawn], 1))
@@ -201,15 +190,6 @@ def _moment_spans(evidence: Evidence, model: Essential, weights: Tensor) -> Tens
     M = row_moments(weights, row_products(evidence.products))
     basis = torch.linalg.eigh(carry.mT @ M @ carry)[1][..., :4].flip(-1).mT
     return torch.unflatten(basis, -1, (3, 3)).mT
-
-
-def _sample_spans(
-    evidence: Evidence, model: Essential, weights: Tensor, order: Tensor, number: int
-) -> tuple[Tensor, Tensor]:
-    """Return the null spaces of minimal samples, (B, S, 4, 3, 3), and which of them are not larger, (B, S) bool."""
-    spans, determined = sample_null_spaces(evidence, weights, order, number, Essential.sample_size)
-    inverse1, inverse2 = (torch.linalg.inv_ex(C)[0][:, None, None] for C in (model.C1, model.C2))
-    return inverse2.mT @ spans @ inverse1, determined
 
 
 def _in_spans(spans: Tensor) -> Candidates:

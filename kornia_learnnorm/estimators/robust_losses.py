@@ -4,6 +4,7 @@ A loss returns its value and its derivative by the squared distance, which is th
 squares.
 """
 
+import math
 from dataclasses import dataclass
 from numbers import Real
 
@@ -33,8 +34,8 @@ class _RobustLoss:
         scale: object = self.scale
         if not isinstance(scale, Real):
             raise TypeError(f"scale must be a number of pixels, got {scale!r}")
-        if not self.scale > 0:
-            raise ValueError(f"scale must be positive, got {self.scale}")
+        if not 0 < self.scale < math.inf:
+            raise ValueError(f"scale must be positive and finite, got {self.scale}")
 
 
 class Huber(_RobustLoss):

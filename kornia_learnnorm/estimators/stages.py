@@ -1,13 +1,10 @@
 """The stages of a learned layer: features, logits, weights and transforms, matrix; refined, the next stage's input."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from typing import Any
 
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
-from torch import Tensor, nn
+from torch import Tensor
 
 from kornia_learnnorm.estimators.linear import solve_in_coordinates
 from kornia_learnnorm.estimators.network_features import CommonFrame, match_features, residual_features
@@ -28,44 +25,35 @@ MAX_SETS_ON_GPU = 2000  # that are searched at once: PyTorch cannot decompose th
 MAX_MATCHES = 8192  # at once, whose features fit into a processor's cache
 
 
-def run_stages(
-    model: TwoViewModel,
-    networks: nn.ModuleList,
-    problem: LinearProblem,
-    scores: Tensor | None,
-    learn_transforms: bool,
-    refine_steps: int,
-    detach_stages: bool,
-    refinement: Callable[[LinearProblem, CommonFrame], Refinement],
-) -> tuple[Tensor, Tensor]:
+def run_stages(layer: Any, problem: LinearProblem, scores: Tensor | None) -> tuple[Tensor, Tensor]:
     """Return matrices (B, S, 3, 3) and logits (B, S, N) of the stages, for sets that determine their matrix.
 
     Unless stages are detached, the refined matrices of the last stage follow. Sets that are settled after the first
     stage keep what it gives in the others. All but the last change of coordinates is the common frame's.
     """
-    present = problem.present
+    model, present, detach_stages = layer.model, problem.present, layer.detach_stages
     frame = CommonFrame.from_points(problem.points1, problem.points2, present)
     features, factor = match_features(frame, scores, present), None
     found: list[tuple[Tensor, Tensor]] = []
     with torch.set_grad_enabled(torch.is_grad_enabled() and not detach_stages):
-        refine = refinement(problem, frame)
-    dtype = next(networks.parameters()).dtype
+        refine: Refinement = layer.refinement(model, problem, frame, layer.samples, not layer.training)
+    dtype = next(layer.networks.parameters()).dtype
     settled: Tensor | None = None
-    for network in networks:
+    for network in layer.networks:
         if refine.all_settled:
             found.append(found[0])
             continue
         seen = features
         if found:
             with torch.set_grad_enabled(torch.is_grad_enabled() and not detach_stages):
-                before = refine(*found[-1], min(EARLY_STEPS, refine_steps))
+                before = refine(*found[-1], min(EARLY_STEPS, layer.refine_steps))
                 residuals, factor = residual_features(model, refine.x1, refine.x2, *before, present)
             seen = torch.cat([features, residuals], -1)
         logits, params = network(seen.to(dtype), None if present is None else present == 0)
         logits, params = logits.to(problem.x1), params.to(problem.x1)
         weights = logits.sigmoid() if factor is None else logits.sigmoid() * factor
         weights = weights if problem.weights is None else weights * problem.weights
-        M = _solve_weighted(model, frame, weights, present, params if learn_transforms else None)
+        M = _solve_weighted(model, frame, weights, present, params if layer.learn_transforms else None)
         if settled is not None:
             M = torch.where(settled[:, None, None], found[0][0], M)
             logits = torch.where(settled[:, None], found[0][1], logits)
@@ -73,7 +61,7 @@ def run_stages(
         if len(found) == 1 and not detach_stages:
             settled = refine.settled(logits)
     if not detach_stages:
-        found.append(refine(*found[-1], refine_steps, last=True))
+        found.append(refine(*found[-1], layer.refine_steps, last=True))
     matrices, all_logits = zip(*found, strict=True)
     T = frame.T[:, None]
     return unit_matrix(model.carry(torch.stack(matrices, 1), T, T)), torch.stack(all_logits, 1)
@@ -129,13 +117,8 @@ class Refinement:
         self.samples, self.settle = samples if searched else 0, settle
         self.few_outliers: Tensor | None = None
         self.all_settled = False
-        self.minimal: Tensor | None = None
-        self.is_minimal: Tensor | None = None
-        if problem.x1.shape[1] > model.min_points and problem.weights is None:
-            return
-        self.minimal = _solve_minimal(model, problem, frame, self.x1, self.x2)
-        if problem.weights is not None:
-            self.is_minimal = ((problem.weights > 0).sum(1) <= model.min_points)[:, None, None]
+        few = problem.weights is not None or problem.x1.shape[1] <= model.min_points
+        self.minimal = _solve_minimal(model, problem, frame, self.x1, self.x2) if few else None
 
     def __call__(self, M: Tensor, logits: Tensor, steps: int, last: bool = False) -> tuple[Tensor, Tensor]:
         """Return a stage's matrices after so many steps, and its logits."""
@@ -143,8 +126,9 @@ class Refinement:
             # The stage has no effect; through the zero, its network, scores and weights still get a gradient of zero.
             return self.minimal + 0.0 * M, logits
         refined = self.optimize(M, logits.sigmoid(), steps, last)
-        if self.minimal is not None and self.is_minimal is not None:
-            refined = torch.where(self.is_minimal, self.minimal, refined)
+        if self.minimal is not None and self.weights is not None:
+            is_minimal = ((self.weights > 0).sum(1) <= self.model.min_points)[:, None, None]
+            refined = torch.where(is_minimal, self.minimal, refined)
         return refined, logits
 
     def settled(self, logits: Tensor) -> Tensor | None:

@@ -144,7 +144,7 @@ def is_known_true(condition: Tensor) -> bool:
 
 def check_whole_number(name: str, value: object, least: int) -> None:
     """Raise a ValueError for anything but a whole number of at least ``least``."""
-    if not isinstance(value, int) or value < least:
+    if not isinstance(value, int) or isinstance(value, bool) or value < least:
         raise ValueError(f"{name} must be a whole number, at least {least}, got {value!r}")
 
 

@@ -1,4 +1,4 @@
-r"""Linear algebra: design matrix and null vector of the DLT, normal equations of least-squares steps.
+r"""Linear algebra of the DLT: design matrices, null vectors and null spaces.
 
 Every function is batched and has derivatives that stay finite on degenerate input.
 """

@@ -17,17 +17,10 @@ MONOMIALS = sorted((m for m in product(range(4), repeat=3) if sum(m) <= 3), key=
 MAX_IMAGINARY = 1e-6  # relative imaginary part of a real solution
 
 
-def _monomial_table() -> Tensor:
-    """Return which monomial the product of three of the four coefficients (x, y, z, 1) is, (64, 20)."""
-    table = torch.zeros(64, 20, dtype=torch.float64)
-    for row, factors in enumerate(product(range(4), repeat=3)):
-        exponents: tuple[int, ...] = tuple(factors.count(k) for k in range(3))
-        table[row, MONOMIALS.index(exponents)] = 1.0
-    return table
-
-
 _FIRST, _SECOND = torch.triu_indices(4, 4)
-_TABLE = _monomial_table()
+# Which monomial the product of three of the four coefficients (x, y, z, 1) is, (64, 20).
+_PRODUCTS = [MONOMIALS.index(tuple(map(factors.count, range(3)))) for factors in product(range(4), repeat=3)]
+_TABLE = torch.eye(20, dtype=torch.float64)[_PRODUCTS]
 _PAIRS = _TABLE.view(16, 4, 20)[4 * _FIRST + _SECOND].flatten(0, 1)  # of products of two coefficients, each once
 _TIMES_X = [MONOMIALS.index((a + 1, b, c)) for a, b, c in MONOMIALS[10:]]  # each of the others times x
 _SOLUTION = [MONOMIALS.index(m) - 10 for m in ((1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0))]

@@ -31,6 +31,9 @@ def relative_pose(
         the device has it, in the dtype of ``F_mat``. Both are NaN where ``F_mat`` is not finite or of rank below two,
         or where two poses tie for the most votes.
 
+        Derivatives are those of a decomposition: NaN where E has two equal singular values, as an exact one has. Take
+        :class:`~kornia_learnnorm.LearnedRelativePose` for a loss of the pose.
+
     Raises:
         TypeError: if a tensor is not floating-point or the mask is not boolean.
         ShapeError: if a shape is wrong.
@@ -47,41 +50,6 @@ def relative_pose(
         >>> bool((R - scene.R).abs().max() < 1e-6)
         True
     """
-    _check(F_mat, K1, K2, points1, points2, mask)
-    dtype, work = F_mat.dtype, solve_dtype(F_mat.device)
-    F_mat, K1, K2, points1, points2 = (value.to(work) for value in (F_mat, K1, K2, points1, points2))
-    E_mat = essential_from_fundamental(F_mat, K1, K2)
-    E_mat = torch.where(E_mat.isfinite().all(-1, keepdim=True).all(-2, keepdim=True), E_mat, 0.0)
-    R, t = motion_from_essential(E_mat)
-    t = t[..., 0]
-    front = _in_front(R, t, _rays(points1, K1), _rays(points2, K2))
-    votes = (front if mask is None else front & mask[:, None]).sum(-1)
-    first, second = votes.topk(2).values.unbind(-1)
-    known = (first > second) & (torch.linalg.matrix_rank(E_mat) >= 2)
-    row, best = torch.arange(len(R), device=R.device), votes.argmax(-1)
-    R = torch.where(known[:, None, None], R[row, best], torch.nan)
-    return R.to(dtype), torch.where(known[:, None], t[row, best], torch.nan).to(dtype)
-
-
-def choose_pose(
-    R: Tensor, t: Tensor, points1: Tensor, points2: Tensor, K1: Tensor, K2: Tensor, weights: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return the poses (B, 3, 3) and (B, 3), of several (B, S, 3, 3) and (B, S, 3), with most weight in front."""
-    with torch.no_grad():
-        votes = (_in_front(R, t, _rays(points1, K1), _rays(points2, K2)) * weights[:, None]).sum(-1)
-        best = votes.argmax(1)[:, None, None]
-    return R.gather(1, best[..., None].expand(-1, 1, 3, 3))[:, 0], t.gather(1, best.expand(-1, 1, 3))[:, 0]
-
-
-def in_front(R: Tensor, t: Tensor, K1: Tensor, K2: Tensor, points1: Tensor, points2: Tensor) -> Tensor:
-    """Return which correspondences are triangulated in front of both cameras, (B, N) bool; false where a pose is NaN.
-
-    Poses are :math:`X_2 = R X_1 + t` with :math:`t` (B, 3) of any length, points pixels (B, N, 2).
-    """
-    return _in_front(R[:, None], t[:, None], _rays(points1, K1), _rays(points2, K2))[:, 0]
-
-
-def _check(F_mat: Tensor, K1: Tensor, K2: Tensor, points1: Tensor, points2: Tensor, mask: Tensor | None) -> None:
     named = {"F_mat": F_mat, "K1": K1, "K2": K2, "points1": points1, "points2": points2}
     for name, value in named.items():
         check_tensor(name, value, ["B", "N", "2"] if name.startswith("points") else ["B", "3", "3"])
@@ -92,21 +60,40 @@ def _check(F_mat: Tensor, K1: Tensor, K2: Tensor, points1: Tensor, points2: Tens
         raise ValueError(f"all must be of one batch, got {sizes}")
     if mask is not None:
         check_mask(mask, points1, points2)
+    dtype, work = F_mat.dtype, solve_dtype(F_mat.device)
+    F_mat, K1, K2, points1, points2 = (value.to(work) for value in (F_mat, K1, K2, points1, points2))
+    E_mat = essential_from_fundamental(F_mat, K1, K2)
+    E_mat = torch.where(E_mat.isfinite().all(-1, keepdim=True).all(-2, keepdim=True), E_mat, 0.0)
+    R, t = motion_from_essential(E_mat)
+    t = t[..., 0]
+    front = in_front(R, t, K1, K2, points1, points2)
+    votes = (front if mask is None else front & mask[:, None]).sum(-1)
+    first, second = votes.topk(2).values.unbind(-1)
+    known = (first > second) & (torch.linalg.matrix_rank(E_mat, rtol=8 * torch.finfo(dtype).eps) >= 2)
+    row, best = torch.arange(len(R), device=R.device), votes.argmax(-1)
+    R = torch.where(known[:, None, None], R[row, best], torch.nan)
+    return R.to(dtype), torch.where(known[:, None], t[row, best], torch.nan).to(dtype)
 
 
-def _rays(points: Tensor, K: Tensor) -> Tensor:
-    """Return directions of pixels, ``(B, 1, N, 3)``."""
-    rays: Tensor = torch.linalg.solve(K, convert_points_to_homogeneous(points).mT)
-    return rays.mT[:, None]
+def choose_pose(
+    R: Tensor, t: Tensor, points1: Tensor, points2: Tensor, K1: Tensor, K2: Tensor, weights: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the poses (B, 3, 3) and (B, 3), of several (B, S, 3, 3) and (B, S, 3), with most weight in front."""
+    with torch.no_grad():
+        votes = (in_front(R, t, K1, K2, points1, points2) * weights[:, None]).sum(-1)
+        best = votes.argmax(1)[:, None, None]
+    return R.gather(1, best[..., None].expand(-1, 1, 3, 3))[:, 0], t.gather(1, best.expand(-1, 1, 3))[:, 0]
 
 
-def _in_front(R: Tensor, t: Tensor, rays1: Tensor, rays2: Tensor) -> Tensor:
-    """Return whether the depths of z2 x2 = z1 R x1 + t are positive; crossed with one ray, it leaves the other's depth.
+def in_front(R: Tensor, t: Tensor, K1: Tensor, K2: Tensor, points1: Tensor, points2: Tensor) -> Tensor:
+    """Return which correspondences poses put in front of both cameras, (B, S, N) bool; false where a pose is NaN.
 
-    Poses ``(B, 4, 3, 3)`` and ``(B, 4, 3)``, rays ``(B, 1, N, 3)``, booleans ``(B, 4, N)``.
+    Poses :math:`X_2 = R X_1 + t` are (B, S, 3, 3) and (B, S, 3) of any length, points pixels (B, N, 2). The depths are
+    those of z2 x2 = z1 R x1 + t: crossed with one ray, it leaves the other's depth.
     """
-    turned = rays1 @ R.mT
-    t = t[..., None, :]
+    views = (K1, points1), (K2, points2)
+    rays1, rays2 = (torch.linalg.solve(K, convert_points_to_homogeneous(points).mT).mT[:, None] for K, points in views)
+    turned, t = rays1 @ R.mT, t[..., None, :]
     normal = torch.linalg.cross(rays2, turned)
     depth1 = (torch.linalg.cross(t, rays2) * normal).sum(-1)  # times the squared length of the normal
     depth2 = (torch.linalg.cross(t, turned) * normal).sum(-1)

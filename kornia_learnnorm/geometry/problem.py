@@ -118,6 +118,16 @@ class LinearProblem:
         """Return the same problem, in which the sets marked in ``rows``, (B,) bool, send no gradient."""
         return self._map(lambda v: torch.where(rows.view(-1, *[1] * (v.ndim - 1)), v.detach(), v))
 
+    def with_generic_points(self, determined: Tensor) -> Self:
+        """Return the problem with generic points in place of undetermined sets: no derivative meets one of these."""
+        rows, like = determined[:, None], self.points1
+        numbers = torch.arange(1, like.shape[1] + 1, dtype=like.dtype, device=like.device)[:, None]
+        generic = (numbers * like.new_tensor([2.0, 3.0, 5.0, 7.0]).sqrt()).frac()  # multiples of irrational numbers
+        points1 = torch.where(rows[..., None], self.points1, generic[:, :2])
+        points2 = torch.where(rows[..., None], self.points2, generic[:, 2:])
+        weights = None if self.weights is None else torch.where(rows, self.weights, 1.0)
+        return self.from_points(points1, points2, weights, self.model)
+
     def _map(self, function: Callable[[Tensor], Tensor]) -> Self:
         tensors = (self.points1, self.points2, self.weights, self.T1, self.T2, self.x1, self.x2)
         changed: Any = [None if value is None else function(value) for value in tensors]
@@ -140,37 +150,21 @@ def solve_where_determined(
     problem.solve()
     if problem.all_determined:
         return solve(problem, None)
-    if problem.all_determined is None:
-        return _solve_traced(problem, solve, solve_undetermined)
     determined = problem.determined
+    if problem.all_determined is None:  # without data-dependent shapes, as `torch.compile` and `vmap` need
+        solutions = solve(problem.with_generic_points(determined), None)
+        with torch.no_grad():
+            others = solve_undetermined(problem)
+        return tuple(
+            torch.where(determined.view(-1, *[1] * (value.ndim - 1)), value, other)
+            for value, other in zip(solutions, others, strict=True)
+        )
     found, rest = determined.nonzero()[:, 0], (~determined).nonzero()[:, 0]
     with torch.no_grad():
         others = solve_undetermined(problem.select(rest))
     solutions = solve(problem.select(found), found)
     return tuple(
         value.new_empty(len(determined), *value.shape[1:]).index_copy(0, rest, other).index_copy(0, found, value)
-        for value, other in zip(solutions, others, strict=True)
-    )
-
-
-def _solve_traced(
-    problem: LinearProblem,
-    solve: Callable[[LinearProblem, Tensor | None], tuple[Tensor, ...]],
-    solve_undetermined: Callable[[LinearProblem], tuple[Tensor, ...]],
-) -> tuple[Tensor, ...]:
-    """Return the solutions without data-dependent shapes, as ``torch.compile`` and ``vmap`` need.
-
-    No derivative meets an undetermined set: generic points take its place, and their result is dropped.
-    """
-    rows, points = problem.determined[:, None], (problem.points1, problem.points2)
-    generic = generic_points(problem.points1)
-    points1, points2 = (torch.where(rows[..., None], p, g) for p, g in zip(points, generic, strict=True))
-    weights = None if problem.weights is None else torch.where(rows, problem.weights, 1.0)
-    solutions = solve(LinearProblem.from_points(points1, points2, weights, problem.model), None)
-    with torch.no_grad():
-        others = solve_undetermined(problem)
-    return tuple(
-        torch.where(rows.view(-1, *[1] * (value.ndim - 1)), value, other)
         for value, other in zip(solutions, others, strict=True)
     )
 
@@ -187,23 +181,13 @@ def prepare_problem(
         points1, points2 = (torch.where(mask[..., None], points, 0.0) for points in (points1, points2))
         weights = mask.to(points1) if weights is None else torch.where(mask, weights, 0.0)
     check_correspondences(points1, points2, weights, model.min_points if least is None else least)
-    weights = None if weights is None else _rescale(weights.to(solve_dtype(points1.device)))
+    if weights is not None:
+        weights = weights.to(solve_dtype(points1.device))
+        # Scaled where the largest would over- or underflow; sets with none above 1e-30 get zeros.
+        top = weights.detach().amax(-1, keepdim=True)
+        weights = torch.where(top < 1e-30, 0.0, weights)
+        weights = weights / torch.where((top < 1e-30) | ((top > 1e-15) & (top < 1e15)), 1.0, top)
     return LinearProblem.from_points(points1, points2, weights, model)
-
-
-def _rescale(weights: Tensor) -> Tensor:
-    """Return weights scaled where the largest would over- or underflow; sets with none above 1e-30 get zeros."""
-    top = weights.detach().amax(-1, keepdim=True)
-    weights = torch.where(top < 1e-30, 0.0, weights)
-    return weights / torch.where((top < 1e-30) | ((top > 1e-15) & (top < 1e15)), 1.0, top)
-
-
-def generic_points(like: Tensor) -> tuple[Tensor, Tensor]:
-    """Return correspondences (B, N, 2) that determine a matrix: multiples of irrational numbers, modulo one."""
-    index = torch.arange(1, like.shape[1] + 1, dtype=like.dtype, device=like.device)[:, None]
-    roots = torch.tensor([2.0, 3.0, 5.0, 7.0], dtype=like.dtype, device=like.device).sqrt()
-    points = (index * roots).frac().expand(like.shape[0], -1, -1)
-    return points[..., :2], points[..., 2:]
 
 
 def hartley_coordinates(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from kornia_learnnorm.geometry.checks import check_correspondences, check_matrices, safe_divisor, solve_dtype
+from kornia_learnnorm.geometry.checks import check_correspondences, check_matrices, safe_divisor
 from kornia_learnnorm.geometry.distances import line_norms
 from kornia_learnnorm.geometry.dlt import design_matrix
 from kornia_learnnorm.geometry.matrices import cofactors, inverse, nearest_rank2, unit_matrix
-from kornia_learnnorm.geometry.problem import hartley_coordinates
+from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import transform_fundamental
 
 ITERATIONS = 3  # steps of the optimal correction
@@ -66,27 +66,36 @@ def optimal_rank2(F_mat: Tensor, points1: Tensor, points2: Tensor, weights: Tens
     """
     check_correspondences(points1, points2, weights)
     check_matrices("F_mat", F_mat, len(points1))
-    dtype = solve_dtype(points1.device)
-    weights = None if weights is None else weights.to(dtype)
-    (x1, x2), (T1, T2) = hartley_coordinates(torch.stack([points1, points2]).to(dtype), weights)
-    F_hat = transform_fundamental(F_mat.to(x1), inverse(T1), inverse(T2))
-    F_hat = correct_rank2(F_hat, x1, x2, weights, T1[:, 0, 0] / T2[:, 0, 0])
-    return unit_matrix(transform_fundamental(F_hat, T1, T2)).to(points1.dtype)
+    problem = LinearProblem.from_points(points1, points2, weights, None)
+    F_hat = transform_fundamental(F_mat.to(problem.x1), inverse(problem.T1), inverse(problem.T2))
+    F_mat = transform_fundamental(correct_rank2(problem, F_hat), problem.T1, problem.T2)
+    return unit_matrix(F_mat).to(points1.dtype)
 
 
-def correct_rank2(F_hat: Tensor, x1: Tensor, x2: Tensor, weights: Tensor | None, scale: Tensor) -> Tensor:
-    """Return the optimal correction of matrices (B, 3, 3) in Hartley's coordinates; see :func:`optimal_rank2`.
-
-    Points are homogeneous, (B, N, 3). ``scale`` is that of view 1 over that of view 2, (B,): noise that is equal in
-    pixels is not equal there.
-    """
-    u = normalize(F_hat.flatten(-2), dim=-1)
-    u = _correct(u, _covariance(u, x1, x2, weights, scale[:, None]))
+def correct_rank2(problem: LinearProblem, M: Tensor) -> Tensor:
+    """Return the optimal correction of matrices (B, 3, 3) in a problem's coordinates; see :func:`optimal_rank2`."""
+    u = normalize(M.flatten(-2), dim=-1)
+    covariance = _covariance(problem, u)
+    visited: list[Tensor] = []
+    for _ in range(ITERATIONS):
+        visited.append(u)
+        gradient = step = cofactors(torch.unflatten(u, -1, (3, 3))).flatten(-2)
+        # Projecting the vectors costs less than projecting V_0.
+        for direction in reversed(visited):
+            step = _project(step, direction)
+        step = (covariance @ step[..., None]).squeeze(-1)
+        for direction in visited:
+            step = _project(step, direction)
+        slope = (gradient * step).sum(-1, keepdim=True)
+        residual = (u * gradient).sum(-1, keepdim=True) / 3
+        u = normalize(u - residual / torch.where(slope > 0, slope, 1.0) * step, dim=-1)
     return nearest_rank2(torch.unflatten(u, -1, (3, 3)))
 
 
-def _covariance(u: Tensor, x1: Tensor, x2: Tensor, weights: Tensor | None, scale: Tensor) -> Tensor:
+def _covariance(problem: LinearProblem, u: Tensor) -> Tensor:
     """Return a matrix that equals ``V_0`` of the unit vectors ``u`` up to scale once projected, ``(B, 9, 9)``."""
+    x1, x2, weights = problem.x1, problem.x2, problem.weights
+    scale = (problem.T1[:, 0, 0] / problem.T2[:, 0, 0])[:, None]  # noise that is equal in pixels is not equal there
     # (u, V_i u) is the sum of the squared normals of both epipolar lines.
     n1, n2 = line_norms(x1.mT, x2.mT, torch.unflatten(u, -1, (3, 3)), weights, floor=EPIPOLE_FLOOR)
     variance = scale * n1.square() + n2.square() / scale
@@ -102,23 +111,6 @@ def _covariance(u: Tensor, x1: Tensor, x2: Tensor, weights: Tensor | None, scale
     covariance = torch.linalg.inv_ex(precision)[0]
     held = covariance.detach().diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None] * size > 1 / (64 * ridge)
     return torch.where(held, covariance.detach(), covariance)
-
-
-def _correct(u: Tensor, covariance: Tensor) -> Tensor:
-    visited: list[Tensor] = []
-    for _ in range(ITERATIONS):
-        visited.append(u)
-        gradient = step = cofactors(torch.unflatten(u, -1, (3, 3))).flatten(-2)
-        # Projecting the vectors costs less than projecting V_0.
-        for direction in reversed(visited):
-            step = _project(step, direction)
-        step = (covariance @ step[..., None]).squeeze(-1)
-        for direction in visited:
-            step = _project(step, direction)
-        slope = (gradient * step).sum(-1, keepdim=True)
-        residual = (u * gradient).sum(-1, keepdim=True) / 3
-        u = normalize(u - residual / torch.where(slope > 0, slope, 1.0) * step, dim=-1)
-    return u
 
 
 def _project(vector: Tensor, u: Tensor) -> Tensor:

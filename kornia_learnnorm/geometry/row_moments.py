@@ -39,13 +39,7 @@ def normal_equations(M: Tensor, pull: Tensor, tangents: Tensor) -> tuple[Tensor,
     return normal, along @ pull
 
 
-def _row_entries() -> Tensor:
-    """Return the matrix (36, 81) from the different entries of a symmetric matrix of rows to all of them."""
-    place = torch.zeros(6, 3, 3, dtype=torch.float64)
-    first, second = _PAIRS
-    place[range(6), first, second] = place[range(6), second, first] = 1.0
-    return torch.einsum("spq,tab->stpaqb", place, place).reshape(36, 81)
-
-
 _PAIRS = torch.triu_indices(3, 3)
-_ROW_ENTRIES = _row_entries()
+# From the different entries of a symmetric matrix, (3, 3) and of rows (9, 9), to all of them.
+ENTRIES = torch.eye(6, dtype=torch.float64)[torch.tensor([[0, 1, 2], [1, 3, 4], [2, 4, 5]])]
+_ROW_ENTRIES = torch.einsum("pqs,abt->stpaqb", ENTRIES, ENTRIES).reshape(36, 81)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from math import inf
 
 import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.metrics import angle_error_mat, angle_error_vec, auc_from_errors
 from torch import Tensor
 
@@ -28,6 +29,8 @@ def pose_error(R: Tensor, t: Tensor, R_true: Tensor, t_true: Tensor) -> Tensor:
         >>> pose_error(R, t, torch.eye(3), torch.tensor([0.0, 1.0, 1.0]))
         tensor([45., inf])
     """
+    for value, shape in ((R, "33"), (R_true, "33"), (t, "3"), (t_true, "3")):
+        KORNIA_CHECK_SHAPE(value, ["*", *shape])
     R, t = R.expand_as(R + R_true), t.expand_as(t + t_true)  # Kornia's functions take equal shapes
     R_true, t_true = R_true.expand_as(R), t_true.expand_as(t)
     error = torch.maximum(angle_error_mat(R, R_true), angle_error_vec(t, t_true))

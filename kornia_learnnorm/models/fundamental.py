@@ -90,16 +90,11 @@ class Fundamental(TwoViewModel):
             return T2.mT @ nearest_rank2(M) @ T1
         if T1 is not problem.T1:
             M = self.carry(M, *(torch.stack([T1, T2]) @ inverse(torch.stack([problem.T1, problem.T2]))))
-        return self.carry(self.correct(problem, M), problem.T1, problem.T2)
-
-    def correct(self, problem: LinearProblem, M: Tensor) -> Tensor:
-        """Return the optimal correction of matrices in the problem's coordinates."""
-        scale = problem.T1[:, 0, 0] / problem.T2[:, 0, 0]
-        return correct_rank2(M, problem.x1, problem.x2, problem.weights, scale)
+        return self.carry(correct_rank2(problem, M), problem.T1, problem.T2)
 
     def solve_minimal(self, problem: LinearProblem) -> Tensor:
         """Return the optimal correction of the null matrices."""
-        return self.correct(problem, problem.null_matrix)
+        return correct_rank2(problem, problem.null_matrix)
 
     def fallback(self, M: Tensor) -> Tensor:
         """Return F of a sideways motion in place of matrices of rank 1, which at most one point gives."""
@@ -203,22 +198,18 @@ class Rank2(NamedTuple):
         return type(self)(self.axes + self.axes @ rotation, torch.unflatten(unit, -1, (2, 2)))
 
 
-def _turns(a: Tensor) -> Tensor:
-    """Return orthonormal directions (*, 3, 4) orthogonal to unit quaternions (*, 4): i, j and k times them."""
-    a, b, c, d = a.unbind(-1)
-    return torch.unflatten(torch.stack([-b, a, -d, c, -c, d, a, -b, -d, -c, b, a], -1), -1, (3, 4))
+def _linear_maps() -> tuple[Tensor, Tensor]:
+    """Return what is linear in the entries of A: turns (4, 3, 4), and derivatives (4, 3, 3, 7) of U^T F V by a step.
+
+    Turns are orthonormal directions orthogonal to unit quaternions: i, j and k times them.
+    """
+    a, b, c, d = eye = torch.eye(4, dtype=torch.float64)
+    turns = torch.stack([-b, a, -d, c, -c, d, a, -b, -d, -c, b, a], -1).view(4, 3, 4)
+    A, derivatives = eye.view(4, 2, 2), eye.new_zeros(4, 3, 3, 7)
+    derivatives[:, 2, :2, :2], derivatives[:, :2, 2, 2:4] = A.mT, A
+    derivatives[:, :2, :2, 4:] = torch.unflatten(turns.mT, -2, (2, 2))
+    return turns.flatten(1), derivatives.flatten(1)
 
 
-def _axis_tangents(a: Tensor) -> Tensor:
-    """Return derivatives (*, 3, 3, 7) of U^T F V by a step; A is (*, 4)."""
-    A, derivatives = torch.unflatten(a, -1, (2, 2)), a.new_zeros(*a.shape[:-1], 3, 3, 7)
-    derivatives[..., 2, :2, :2] = A.mT
-    derivatives[..., :2, 2, 2:4] = A
-    derivatives[..., :2, :2, 4:] = torch.unflatten(_turns(a).mT, -2, (2, 2))
-    return derivatives
-
-
-# All three functions are linear: one product with their values at the unit vectors computes them.
-_TURNS = _turns(torch.eye(4, dtype=torch.float64)).flatten(1)
-_TANGENTS = _axis_tangents(torch.eye(4, dtype=torch.float64)).flatten(1)
+_TURNS, _TANGENTS = _linear_maps()
 _SKEW = torch.tensor([[0, 0, -1, 0, 0, 0, 1, 0, 0], [0, 0, 0, 0, 0, -1, 0, 1, 0]], dtype=torch.float64)

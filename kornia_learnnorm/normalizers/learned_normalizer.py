@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from kornia_learnnorm import pretrained
 from kornia_learnnorm.geometry import transforms
-from kornia_learnnorm.geometry.checks import read_condition
+from kornia_learnnorm.geometry.checks import check_whole_number, read_condition
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import spd_transform, transform_points
 from kornia_learnnorm.normalizers import closed_form, reweighted
@@ -62,8 +62,8 @@ class LearnedNormalizer(ProblemNormalizer):
         max_points: int | None = None,
     ) -> None:
         super().__init__()
-        if max_points is not None and max_points < 8:
-            raise ValueError(f"max_points must be at least 8 or None, got {max_points}")
+        if max_points is not None:
+            check_whole_number("max_points", max_points, 8)
         self.base: Normalizer = ReweightedWhitening() if base is None else base
         self.network = CrossViewNetwork() if network is None else network
         self.transform = transform

@@ -1,1 +1,1 @@
-"""Robust estimation: RANSAC, samplers, scoring, constrained fit, soft RANSAC."""
+"""Robust estimation: RANSAC, samplers, scoring, local optimisation, last fit, soft RANSAC."""

@@ -25,7 +25,7 @@ POOL_SIZE = 2  # best hypotheses, of which correspondences in front of both came
 
 
 def fit_final(scorer: PairScorer, pool: Hypotheses) -> Any:
-    """Return the optimum (1, 3, 3) on all correspondences that is next to the best of the pool."""
+    """Return the state of the optimum on all correspondences that is next to the best of the pool."""
     model, threshold = scorer.model, scorer.threshold
     loss = GemanMcClure(LOSS_SCALE * threshold)
     fit = model.reweighted_fit(scorer.x1, scorer.x2, pool.F_mat, [Truncated(threshold), *STEPS * [loss]])
@@ -36,11 +36,14 @@ def fit_final(scorer: PairScorer, pool: Hypotheses) -> Any:
     if not float(fit.gain[best]) <= MIN_GAIN:
         optimum = minimize(scorer.cost(loss), state, MAX_LM_STEPS, TOLERANCE)[1]
         state, cost = optimum.state, float(optimum.cost[0])
-    return state if cost <= _largest_cost(scorer, pool) else model.state(pool.F_mat[:1])
+    # The loss is nowhere above that of MSAC: so much does an optimum cost at most, up to a margin for the scores.
+    share = 1 - float(pool.score[0]) / scorer.terms.shape[-1]
+    most = threshold**2 * (1.1 * share * scorer.x1.shape[-1] + model.sample_size)
+    return state if cost <= most else model.state(pool.F_mat[:1])
 
 
 def _fit_on_manifold(scorer: PairScorer, M: Tensor, loss: Loss) -> Any:
-    """Return the optimum (1, 3, 3) of the model that is next to the best of some matrices (K, 3, 3).
+    """Return the state of the optimum of the model that is next to the best of some matrices (K, 3, 3).
 
     Correspondences behind a camera are mismatches: they neither vote nor count in the fit. Where the correspondences
     contradict the cameras, the optimum is that of fundamental matrices, if its pose still fits.
@@ -65,10 +68,3 @@ def _fit_on_manifold(scorer: PairScorer, M: Tensor, loss: Loss) -> Any:
     pose: Any = model.state(free.matrix())
     wide = square_scale.clamp(min=POSE_PIXELS**2)
     return free if bool(keeps_fit(evidence, state, pose, weights, wide)) else state
-
-
-def _largest_cost(scorer: PairScorer, pool: Hypotheses) -> float:
-    """Return what an optimum costs at most: the loss is nowhere above that of MSAC, up to a margin for the scores."""
-    share = 1 - float(pool.score[0]) / scorer.terms.shape[-1]
-    most: float = scorer.threshold**2 * (1.1 * share * scorer.x1.shape[-1] + scorer.model.sample_size)
-    return most

@@ -91,7 +91,7 @@ class RANSAC(nn.Module):
             the root of the sum of both squared transfer errors.
 
     Raises:
-        TypeError: if ``normalizer`` or ``distance`` cannot be called, or an argument that must be a number is not one.
+        TypeError: if ``normalizer`` cannot be called, or an argument that must be a number is not one.
         ValueError: if a number is out of its range, or there is no such ``distance`` or ``rank2``.
 
     Reference:

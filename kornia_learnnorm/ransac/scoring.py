@@ -26,8 +26,6 @@ class Hypotheses(NamedTuple):
 
     def join(self, other: Self, number: int) -> Self:
         """Return the best of both, at most so many; ``other`` comes first in ties."""
-        if len(self.score) == 0:
-            return type(self)(other.F_mat[:number], other.score[:number])
         both = type(self)(*(torch.cat([theirs, ours]) for ours, theirs in zip(self, other, strict=True)))
         order = both.score.argsort(descending=True, stable=True)[:number]
         return type(self)(*(values[order] for values in both))

@@ -155,7 +155,8 @@ def expected_loss(
 
 def _check(points1: Tensor, samples: Tensor, log_probs: Tensor | None) -> None:
     if not isinstance(samples, Tensor) or samples.dtype != torch.int64:
-        raise TypeError(f"samples must be an int64 tensor, got {getattr(samples, 'dtype', type(samples))}")
+        got = samples.dtype if isinstance(samples, Tensor) else type(samples)
+        raise TypeError(f"samples must be an int64 tensor, got {got}")
     KORNIA_CHECK_SHAPE(samples, ["B", "K", "8"])
     if len(samples) != len(points1):
         raise ValueError(f"samples of {len(points1)} sets of points are needed, got {len(samples)}")

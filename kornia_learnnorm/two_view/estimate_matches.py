@@ -163,7 +163,7 @@ def _answer_fundamental(solver: TwoViewSolver, found: Solution, size1: Size, siz
     if not bool(R.isfinite().all()):
         text = "the matches do not decide between the four poses of the essential matrix"
         return fields, error, (*doubts, PairWarning("no_pose", text))
-    return fields | {"R": R[0], "t": t[0], "front": in_front(R, t, K1, K2, x1, x2)[0]}, error, doubts
+    return fields | {"R": R[0], "t": t[0], "front": in_front(R[None], t[None], K1, K2, x1, x2)[0, 0]}, error, doubts
 
 
 def _compare_free(solver: TwoViewSolver, F_mat: Tensor | None) -> tuple[PairWarning, ...]:
@@ -213,7 +213,7 @@ def _answer_homography(solver: TwoViewSolver, H_mat: Tensor, F_mat: Tensor | Non
     angles = torch.tensor([angle_between(poses[0], plane_poses(part, *seen)) for part in found.parts]).double()
     fields["R"] = R
     if t is not None:
-        front = in_front(R[None], t[None], *(value[None] for value in (*cameras, *matches)))[0]
+        front = in_front(R[None, None], t[None, None], *(value[None] for value in (*cameras, *matches)))[0, 0]
         fields |= {"F_mat": poses[0].fundamental(*cameras), "E_mat": poses[0].essential(), "t": t, "n": n}
         fields |= {"front": front, "other_pose": others[0] if others else None}
     return fields, predicted_error.predict_transfer_error(*about, angles), ()

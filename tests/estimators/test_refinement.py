@@ -263,8 +263,8 @@ def test_weights_of_losses(loss):
 
 @pytest.mark.parametrize("kind", [Huber, Cauchy, GemanMcClure, Truncated])
 def test_scale_must_be_positive(kind):
-    for scale in (0.0, -1.0, float("nan")):
-        with pytest.raises(ValueError, match=f"scale must be positive, got {scale}"):
+    for scale in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match=f"scale must be positive and finite, got {scale}"):
             kind(scale)
     with pytest.raises(TypeError, match="scale must be a number of pixels, got '1'"):
         kind("1")

@@ -61,12 +61,13 @@ class TestRelativePose:
 
     def test_failures_leave_the_others_alone(self):
         (F, *rest), truth = pair("orbit", 6, 20)
-        vector = torch.tensor([[1.0], [2.0], [3.0]], dtype=torch.float64)
+        vector = torch.tensor([[1.1], [2.3], [3.7]], dtype=torch.float64)
         F[0], F[1], F[2], F[3, 0, 0] = NAN, 0.0, vector @ vector.mT, INF
         mask = torch.ones(6, 20, dtype=torch.bool)
         mask[4] = False
         R, t = relative_pose(F, *rest, mask=mask)
         assert torch.cat([R[:5].flatten(), t[:5].flatten()]).isnan().all()
+        assert relative_pose(*(value.float() for value in (F, *rest)), mask=mask)[0][:5].isnan().all()
         error = pose_error(R, t, *truth)
         assert (error[:5] == INF).all()
         assert error[5] < 1e-6

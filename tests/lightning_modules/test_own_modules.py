@@ -101,7 +101,7 @@ def test_nothing_is_imported_without_trust(weights, monkeypatch):
     with pytest.raises(ValueError, match=message):
         kln.LearnedNormalizer.from_pretrained(weights)
     with pytest.raises(ValueError, match="is not of this package"):
-        kln.LearnedNormalizer.from_pretrained(weights, own_modules=["os"])
+        kln.LearnedNormalizer.from_pretrained(weights, own_modules="my_own_modules")
     assert "own_modules" not in sys.modules
 
 

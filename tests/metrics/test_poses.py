@@ -41,7 +41,7 @@ class TestPoseError:
 
     def test_exceptions(self):
         R, t = torch.eye(3), torch.ones(3)
-        for values in ((R[:2], t, R[:2], t), (R[:, :2], t, R[:, :2], t), (R, t[:2], R, t[:2])):
+        for values in ((R[:2], t, R[:2], t), (R[:, :2], t, R[:, :2], t), (R, t[:2], R, t[:2]), (R, t[:, None], R, t)):
             with pytest.raises(ShapeError):
                 pose_error(*values)
 

@@ -141,7 +141,7 @@ def test_matches_behind_a_camera_do_not_count_in_the_fit():
     offset = points2[moved] - epipole
     normal = torch.stack([-offset[:, 1], offset[:, 0]], -1) / offset.norm(dim=-1, keepdim=True)
     points2[moved] = epipole - 0.3 * offset + 0.7 * normal
-    front = in_front(R, t, *(v[None] for v in (K1, K2, points1, points2)))[0]
+    front = in_front(R[:, None], t[:, None], *(v[None] for v in (K1, K2, points1, points2)))[0, 0]
     assert not front[moved].any()
     alone = points1[front], points2[front]
     assert up_to_sign(*(estimate(p, cameras).E_mat[None] for p in ((points1, points2), alone))) < 2e-3
