@@ -12,6 +12,7 @@ import pytest
 import torch
 from demo_browser import click_picture, find_browser, opened, served, wait_for_status
 from PIL import Image, ImageColor
+from scenes import raises
 
 from kornia_learnnorm import estimate_pair
 from kornia_learnnorm.data.synthetic.render import render_pair, write_pair
@@ -74,8 +75,7 @@ class TestSolve:
             ({"cameras": "exif"}, "camera exif: image1.png has no focal length"),
         ]:
             given = dict(zip(("image1", "image2"), demo.example_files(), strict=True)) | options
-            with pytest.raises(ValueError, match=message):
-                demo.solve(**given)
+            raises(ValueError, message, demo.solve, **given)
 
     def test_files_are_named_without_their_folder(self, monkeypatch, tmp_path):
         (tmp_path / "none.png").touch()
@@ -124,13 +124,11 @@ def test_only_this_computer_gets_the_page_and_ctrl_c_ends_it():
         assert re.search('<meta\\s+name="viewport"\\s+content="width=device-width', page)  # for phones
         assert re.findall(r"<(?:script|link|img|iframe)[^>]+(?:src|href)=\"(?:https?:)?//[^\"]+", page) == []
         for header in ({"Origin": "http://example.org"}, {"Host": "example.org"}):
-            with pytest.raises(HTTPError, match="403"):
-                urlopen(Request(address, headers=header), timeout=60)
+            raises(HTTPError, "403", urlopen, Request(address, headers=header), timeout=60)
         form = b"--x\r\nContent-Disposition: form-data; name=files; filename=a.png\r\n\r\n%b\r\n--x--\r\n"
         upload = Request(f"{address}gradio_api/upload", form % bytes(demo.MAX_BYTES + 1))
         upload.add_header("Content-Type", "multipart/form-data; boundary=x")
-        with pytest.raises(HTTPError, match="413"):
-            urlopen(upload, timeout=60)
+        raises(HTTPError, "413", urlopen, upload, timeout=60)
         process.send_signal(signal.SIGINT)
         assert process.wait(60) == 0
         assert "Traceback" not in process.stderr.read()

@@ -4,6 +4,7 @@ import json
 
 import pytest
 import torch
+from scenes import raises
 
 import kornia_learnnorm as kln
 
@@ -49,16 +50,13 @@ def test_a_folder_without_a_layer_of_this_package_is_refused(config, folder):
     (folder / "config.json").unlink()
     if config is not None:
         (folder / "config.json").write_text(json.dumps(config))
-    with pytest.raises(ValueError, match=r"config\.json of .*tiny .* LearnedEightPoint"):
-        hub.HubModel.from_pretrained(folder)
+    raises(ValueError, r"config\.json of .*tiny .* LearnedEightPoint", hub.HubModel.from_pretrained, folder)
 
 
 def test_weights_of_another_class_or_none_and_other_modules_are_refused(folder):
     (folder / "config.json").write_text(json.dumps({"class_name": "LearnedNormalizer"}))
-    with pytest.raises(ValueError, match=r"LearnedNormalizer.* LearnedEightPoint"):
-        hub.HubModel.from_pretrained(folder)
+    raises(ValueError, r"LearnedNormalizer.* LearnedEightPoint", hub.HubModel.from_pretrained, folder)
     (folder / "model.safetensors").unlink()
-    with pytest.raises(FileNotFoundError, match=r"model\.safetensors"):
-        hub.HubModel.from_pretrained(folder)
+    raises(FileNotFoundError, r"model\.safetensors", hub.HubModel.from_pretrained, folder)
     with pytest.raises(TypeError, match=r"LearnedEightPoint, LearnedRelativePose, .*, MatchRefiner, got EightPoint"):
         hub.HubModel(kln.EightPoint())

@@ -7,7 +7,7 @@ import sys
 import pytest
 import torch
 from references import signless, up_to_sign
-from scenes import inputs, shaken, shaken_estimator
+from scenes import inputs, raises, shaken, shaken_estimator
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.estimators import fundamental_stages, pose_stages
@@ -164,8 +164,7 @@ class TestNetworks:
             torch.testing.assert_close(torch.from_numpy(got), value, rtol=1e-4, atol=1e-4)
 
     def test_stages(self):
-        with pytest.raises(ValueError, match="no network: its normaliser is Hartley"):
-            export_networks(kln.EightPoint())
+        raises(ValueError, "no network: its normaliser is Hartley", export_networks, kln.EightPoint())
         layer = shaken_estimator(depth=1)
         programs = export_networks(layer)
         assert [*programs] == ["stage1", "stage2"]
@@ -193,15 +192,12 @@ def test_wrong_arguments():
         (kln.EightPoint(), {"inputs": ["scores"]}, ValueError, "weights, mask, got scores"),
         (kln.EightPoint(), {"num_points": 7}, ValueError, "num_points .* 8, got 7"),
     ]:
-        with pytest.raises(error, match=message):
-            export_layer(layer, **options)
+        raises(error, message, export_layer, layer, **options)
 
 
 def test_load_layer():
     kinds = {"tiny": kln.LearnedEightPoint, "pose": kln.LearnedRelativePose, "homography": kln.LearnedHomography}
     assert all(isinstance(load_layer(f"robust-{name}"), kind) for name, kind in kinds.items())
     assert load_layer("crossview").normalizer.max_points == 12
-    with pytest.raises(FileNotFoundError, match=r"'rubust'.* crossview.* robust"):
-        load_layer("rubust")
-    with pytest.raises(ValueError, match=r"\.safetensors"):
-        load_layer(__file__)
+    raises(FileNotFoundError, r"'rubust'.* crossview.* robust", load_layer, "rubust")
+    raises(ValueError, r"\.safetensors", load_layer, __file__)

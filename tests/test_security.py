@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
+from scenes import raises
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
@@ -113,8 +114,7 @@ class TestWeights:
             architecture["network"] = {"name": "CrossViewNetwork", **numbers}
             metadata = {"format": "kornia_learnnorm.normalizer.v1", "architecture": json.dumps(architecture)}
             save_file({"network.set_network.head.2.bias": torch.zeros(5)}, tmp_path / "forged.safetensors", metadata)
-            with pytest.raises(ValueError, match=message):
-                kln.LearnedNormalizer.from_pretrained(tmp_path / "forged.safetensors")
+            raises(ValueError, message, kln.LearnedNormalizer.from_pretrained, tmp_path / "forged.safetensors")
 
 
 @pytest.mark.parametrize("size", [2**31 - 1, 14_000])
@@ -125,15 +125,13 @@ def test_pixels_that_an_image_declares(tmp_path, size):
     path, header = tmp_path / "large.png", struct.pack(">IIBBBBB", size, size, 8, 0, 0, 0, 0)
     parts = [(b"IHDR", header), (b"IDAT", zlib.compress(bytes(1000))), (b"IEND", b"")]
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts))
-    with pytest.raises(ValueError, match=r"large\.png .* exceeds limit of 178956970 pixels"):
-        read_image(path)
+    raises(ValueError, r"large\.png .* exceeds limit of 178956970 pixels", read_image, path)
     assert image_size(path) == (0, 0)
 
 
 def test_no_pickle_in_arrays_is_read(made, tmp_path):
     np.savez(tmp_path / "forged.npz", plain_residual=np.array([Touches(made)], object))
-    with pytest.raises(ValueError, match=r"forged\.npz is damaged"):
-        read_arrays(tmp_path / "forged.npz")
+    raises(ValueError, r"forged\.npz is damaged", read_arrays, tmp_path / "forged.npz")
 
 
 def test_no_load_path_unpickles():

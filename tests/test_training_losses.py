@@ -7,7 +7,7 @@ import pytest
 import torch
 from pairwise import pairwise
 from references import epipolar_distances
-from scenes import ORIGIN, ROWS, scenes, uniform
+from scenes import ORIGIN, ROWS, raises, scenes, uniform
 from torch.autograd import gradcheck
 
 import kornia_learnnorm as kln
@@ -93,8 +93,7 @@ class TestEpipolarLoss:
             *(("heldout_weight", value) for value in (-0.1, 1.1, math.nan)),
             *((name, value) for name in ("floor", "heldout_floor", "ceiling") for value in (0.0, -1.0, math.nan)),
         ]:
-            with pytest.raises(ValueError, match=f"must be .* got .*{value}"):
-                EpipolarLoss(**{name: value})
+            raises(ValueError, f"must be .* got .*{value}", EpipolarLoss, **{name: value})
 
     @pytest.mark.parametrize("heldout", [(), (None, None), (torch.zeros(1, 3, 2), None), (torch.zeros(1, 0, 2),) * 2])
     def test_heldout_points_are_needed_only_with_a_weight(self, heldout):
@@ -141,5 +140,4 @@ class TestLossesOfSets:
 
     @pairwise(loss=[BoundedEpipolarLoss, LogEpipolarLoss, kln.LogEssentialLoss], number=[0.0, -1.0, math.nan])
     def test_exceptions(self, loss, number):
-        with pytest.raises(ValueError, match="must be positive, got"):
-            loss(number)
+        raises(ValueError, "must be positive, got", loss, number)

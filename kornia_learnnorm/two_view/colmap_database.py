@@ -35,6 +35,7 @@ THRESHOLD = 2.0  # pixels, of RANSAC
 INLIER_FACTOR = 2.0  # thresholds within which a match is an inlier: a few coarse ones are better than broken tracks
 MIN_INLIERS = 15  # of a verified pair, COLMAP's own number
 PLANAR_SHARE = 0.8  # of the inliers on one homography, COLMAP's own number
+PLANE_SAMPLES = 512  # are far more than it takes to find one of so many
 Array = NDArray[np.float64]
 
 
@@ -173,7 +174,7 @@ def _estimate(
     number = int(inliers.sum())
     if number < MIN_INLIERS or log_false_alarms(len(scores), number, widest, pair.sizes[1]) > MAX_LOG_FALSE_ALARMS:
         return None
-    H_mat = RANSAC(model="homography", **options).estimate(*(value[inliers] for value in matches)).F_mat
+    H_mat = RANSAC(model="homography", max_samples=PLANE_SAMPLES, **options).estimate(*(value[inliers] for value in matches)).F_mat
     on_plane = transfer_distance(points1[inliers][None], points2[inliers][None], H_mat[None]) < widest
     matrices, pose, config = {"F": F_mat, "H": H_mat}, None, "UNCALIBRATED"
     if K is not None:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scenes import raises
 
 from kornia_learnnorm.cli import estimate as command_module
 from kornia_learnnorm.cli.estimate import add_arguments, run
@@ -128,8 +129,7 @@ class TestOnePair:
             ([*MANY, "--out", "o", "--exhaustive"], ValueError, r"--gap and --exhaustive are for a folder of images"),
         ]:
             words = (f"{planes}/left.png" if text == "IMAGE" else text for text in arguments)
-            with pytest.raises(error, match=message):
-                command(*words, images=() if arguments[:2] == MANY else ("left", "right"))
+            raises(error, message, command, *words, images=() if arguments[:2] == MANY else ("left", "right"))
             assert [*Path().iterdir()] == [Path("list.txt")]
 
 
@@ -159,8 +159,7 @@ class TestManyPairs:
         assert [warning["code"] for warning in json.loads(failed)["warnings"]] == ["blank"]
         assert json.loads(failed)["image2"] == {"file": "late.png", "width": WIDTH, "height": HEIGHT}
         path.write_text("{}}\n")
-        with pytest.raises(ValueError, match=r"pairs\.jsonl is damaged: remove it"):
-            command(*options, images=())
+        raises(ValueError, r"pairs\.jsonl is damaged: remove it", command, *options, images=())
 
     @pytest.mark.parametrize(("options", "pairs"), [([], 2), (["--gap", "2"], 1), (["--exhaustive"], 3)])
     def test_a_folder(self, planes, command, options, pairs):
@@ -185,5 +184,4 @@ class TestManyPairs:
         wrong = {"'a.png b.png\n": "line 1: No clos", "a b c\n": "line 1: .* got 'a b c'", "\n": "no pairs"}
         for text, message in wrong.items():
             path.write_text(text)
-            with pytest.raises(ValueError, match=message):
-                read_pair_list(path)
+            raises(ValueError, message, read_pair_list, path)

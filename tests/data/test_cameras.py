@@ -2,6 +2,7 @@ import math
 
 import numpy as np
 import pytest
+from scenes import raises
 
 from kornia_learnnorm.data.cameras import exif_camera, read_camera
 
@@ -38,8 +39,7 @@ def test_files(tmp_path):
     ]:
         (tmp_path / name).write_bytes(text.encode("latin-1"))
         if isinstance(expected, str):
-            with pytest.raises(ValueError, match=expected):
-                read_camera(str(tmp_path / name))
+            raises(ValueError, expected, read_camera, str(tmp_path / name))
         else:
             fx, fy, cx, cy = expected
             assert read_camera(str(tmp_path / name)).tolist() == [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
@@ -62,8 +62,7 @@ def test_what_is_refused():
         (".", ValueError, "Is a directory"),
         ("exif", ValueError, "an image file expected"),
     ]:
-        with pytest.raises(error, match=message):
-            read_camera(text)
+        raises(error, message, read_camera, text)
 
 
 def test_exif(tmp_path):
@@ -75,8 +74,6 @@ def test_exif(tmp_path):
     assert np.allclose(K, [[focal, 0, 299.5], [0, focal, 199.5], [0, 0, 1]])
     assert np.array_equal(read_camera("exif", tmp_path / "a.jpg"), K)
     Image.new("L", (60, 40)).save(tmp_path / "b.png")
-    with pytest.raises(ValueError, match=r"b\.png has no focal length"):
-        exif_camera(tmp_path / "b.png")
+    raises(ValueError, r"b\.png has no focal length", exif_camera, tmp_path / "b.png")
     (tmp_path / "c.png").write_text("no image")
-    with pytest.raises(ValueError, match=r"c\.png is not an image"):
-        exif_camera(tmp_path / "c.png")
+    raises(ValueError, r"c\.png is not an image", exif_camera, tmp_path / "c.png")

@@ -3,6 +3,7 @@
 import h5py
 import numpy as np
 import pytest
+from scenes import raises
 
 from kornia_learnnorm.data.hloc import read_hloc
 from kornia_learnnorm.data.store import read_store
@@ -58,13 +59,10 @@ def test_broken(paths, which, name, value, message):
         del file[name]
         if value is not None:
             file[name] = value
-    with pytest.raises(ValueError, match=message):
-        read_hloc(*paths)
+    raises(ValueError, message, read_hloc, *paths)
 
 
 def test_missing_and_not_hdf5(paths, tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no file of hloc at .*none\.h5"):
-        read_hloc(paths[0], tmp_path / "none.h5")
+    raises(FileNotFoundError, r"no file of hloc at .*none\.h5", read_hloc, paths[0], tmp_path / "none.h5")
     paths[0].write_bytes(b"not HDF5")
-    with pytest.raises(ValueError, match=r"features\.h5 is not a readable HDF5 file"):
-        read_hloc(*paths)
+    raises(ValueError, r"features\.h5 is not a readable HDF5 file", read_hloc, *paths)

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pairwise import pairwise
-from scenes import DTYPES, SCENES, correspondences, paper, refined, scenes, shaken, small, uniform
+from scenes import DTYPES, SCENES, correspondences, paper, raises, refined, scenes, shaken, small, uniform
 
 import kornia_learnnorm as kln
 from kornia_learnnorm import Hartley, Whitening, find_fundamental, find_homography, optimal_rank2, refine_fundamental
@@ -174,10 +174,8 @@ def test_wrong_correspondences(estimate, least):
 @pytest.mark.parametrize(("F_mat", "error", "message"), ref.WRONG_MATRICES)
 def test_wrong_matrices(F_mat, error, message):
     points = torch.rand(2, 8, 2)
-    with pytest.raises(error, match=message):
-        optimal_rank2(F_mat, points, points)
-    with pytest.raises(error, match=message):
-        refine_fundamental(points, points, F_mat)
+    raises(error, message, optimal_rank2, F_mat, points, points)
+    raises(error, message, refine_fundamental, points, points, F_mat)
 
 
 # Each normaliser with its independent computation.

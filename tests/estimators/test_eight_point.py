@@ -275,7 +275,5 @@ class TestBackEnds:
 
     @pytest.mark.filterwarnings("ignore::DeprecationWarning")
     def test_jit_is_refused(self, layer):
-        with pytest.raises(TypeError, match=r"cannot be compiled by torch\.jit"):
-            torch.jit.script(layer)
-        with pytest.raises(TypeError, match=r"cannot be compiled by torch\.jit"):
-            torch.jit.trace(layer, correspondences("handheld", 3))
+        raises(TypeError, r"cannot be compiled by torch\.jit", torch.jit.script, layer)
+        raises(TypeError, r"cannot be compiled by torch\.jit", torch.jit.trace, layer, correspondences("handheld", 3))

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from pairwise import pairwise
-from scenes import SCENES, correspondences, scenes, uniform
+from scenes import SCENES, correspondences, raises, scenes, uniform
 from torch.autograd import gradcheck
 
 import kornia_learnnorm as kln
@@ -264,10 +264,8 @@ def test_weights_of_losses(loss):
 @pytest.mark.parametrize("kind", [Huber, Cauchy, GemanMcClure, Truncated])
 def test_scale_must_be_positive(kind):
     for scale in (0.0, -1.0, float("nan"), float("inf")):
-        with pytest.raises(ValueError, match=f"scale must be positive and finite, got {scale}"):
-            kind(scale)
-    with pytest.raises(TypeError, match="scale must be a number of pixels, got '1'"):
-        kind("1")
+        raises(ValueError, f"scale must be positive and finite, got {scale}", kind, scale)
+    raises(TypeError, "scale must be a number of pixels, got '1'", kind, "1")
 
 
 POINTS, EYE = uniform(2, 10, 2), torch.eye(3, dtype=torch.float64)
@@ -297,8 +295,7 @@ def test_wrong_arguments():
     ]:
         start = {"F_mat": EYE.repeat(2, 1, 1)} if refine is refine_fundamental else {"E_mat": EYE.repeat(2, 1, 1)}
         cameras = {} if refine is refine_fundamental else {"K1": EYE, "K2": EYE}
-        with pytest.raises(error, match=message):
-            refine(**{"points1": POINTS, "points2": POINTS, **start, **cameras} | wrong)
+        raises(error, message, refine, **{"points1": POINTS, "points2": POINTS, **start, **cameras} | wrong)
 
 
 @pytest.mark.parametrize("num_points", [12, 40])

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from scenes import correspondences
+from scenes import correspondences, raises
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.evaluation.methods import SHIPPED, default_methods, find_method, identify_method, short_name_of
@@ -40,8 +40,7 @@ def test_unknown():
         ("no.such.module:Thing", ValueError, "no normaliser at"),
         ("kornia_learnnorm:__version__", ValueError, "cannot be called"),
     ]:
-        with pytest.raises(error, match=message):
-            find_method(name)
+        raises(error, message, find_method, name)
         assert sys.path == before
 
 
@@ -66,8 +65,7 @@ def test_weights_that_the_wheel_leaves_out(tmp_path, monkeypatch):
     monkeypatch.setattr("kornia_learnnorm.pretrained.WEIGHTS", tmp_path)
     for load in (kln.LearnedNormalizer.from_pretrained, load_layer, find_method):
         load("crossview")
-        with pytest.raises(FileNotFoundError, match="kornia_learnnorm/weights/paper"):
-            load("paper")
+        raises(FileNotFoundError, "kornia_learnnorm/weights/paper", load, "paper")
     assert set(SHIPPED) & {*default_methods()} == {"crossview"}
 
 

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from kornia.core.exceptions import ShapeError
+from scenes import raises
 
 from kornia_learnnorm.geometry.checks import check_cameras, check_tensor, solve_dtype
 
@@ -32,8 +33,7 @@ class TestCameras:
             (K.T, K, ValueError, r"^K1 .*320 240 1.*transposed"),
             (K, torch.stack([K, K.T]).requires_grad_(), ValueError, r"^K2 .*320 240 1.*transposed"),
         ]:
-            with pytest.raises(error, match=message):
-                check_cameras(K1, K2, 2)
+            raises(error, message, check_cameras, K1, K2, 2)
 
     def test_values_are_not_read_in_vmap(self):
         assert torch.func.vmap(focal_length)(torch.stack([K, K.T])).tolist() == [700.0, 700.0]
@@ -45,10 +45,8 @@ def test_a_wrong_shape_names_what_to_write():
         (torch.rand(1, 9, 2), ["N", "2"], r"this takes one pair, points1\[0\]"),
         (torch.rand(9), ["B", "N", "2"], r"^points1 must have shape \(B, N, 2\), got \[9\]$"),
     ]:
-        with pytest.raises(ShapeError, match=hint):
-            check_tensor("points1", points, shape)
-        with pytest.raises(TypeError, match=r"numpy.ndarray.*torch.from_numpy\(points1\)"):
-            check_tensor("points1", points.numpy(), shape)
+        raises(ShapeError, hint, check_tensor, "points1", points, shape)
+        raises(TypeError, r"numpy.ndarray.*torch.from_numpy\(points1\)", check_tensor, "points1", points.numpy(), shape)
 
 
 def test_solve_dtype():

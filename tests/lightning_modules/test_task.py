@@ -3,6 +3,7 @@
 import pytest
 import torch
 from safetensors.torch import load_file
+from scenes import raises
 from train_processes import make_data, make_trainer, normaliser_task
 
 import kornia_learnnorm as kln
@@ -80,15 +81,13 @@ def test_pose_loss_counts_sets_with_cameras_alone():
     assert torch.equal(both[2:], pixels[2:])
     assert (both != pixels)[:2].all()
     assert torch.autograd.grad(both.sum(), F_mat)[0].isfinite().all()
-    with pytest.raises(ValueError, match=r"pose_weight must be in \[0, 1\], got 2"):
-        SetLoss(pose_weight=2)
+    raises(ValueError, r"pose_weight must be in \[0, 1\], got 2", SetLoss, pose_weight=2)
 
 
 def test_a_loss_leaves_the_estimator_as_it_was():
     task, batch = set_task(), SyntheticSets(8).draw(4, 20, block_generator(1))
     task.compute_loss(batch)
-    with pytest.raises(ValueError, match="must be finite"):
-        task.compute_loss(batch._replace(points1=batch.points1 * torch.nan))
+    raises(ValueError, "must be finite", task.compute_loss, batch._replace(points1=batch.points1 * torch.nan))
     assert not task.estimator.detach_stages
     assert not any(network._forward_hooks for network in task.estimator.networks)
 
@@ -162,18 +161,15 @@ def test_every_number_of_steps_has_a_schedule(tmp_path, steps):
 
 def test_a_training_without_an_end_has_no_cycle(tmp_path):
     trainer = make_trainer(tmp_path, max_steps=-1, max_time="00:00:01:00", limit_val_batches=0)
-    with pytest.raises(ValueError, match=r"give trainer.max_steps or trainer.max_epochs"):
-        trainer.fit(set_task(), make_sets())
+    raises(ValueError, r"give trainer.max_steps or trainer.max_epochs", trainer.fit, set_task(), make_sets())
 
 
 @pytest.mark.parametrize(("layer", "kind"), [(kln.Hartley(), "LearnedLayer"), (kln.EightPoint(), "LearnedNormalizer")])
 def test_estimators_that_learn_nothing_are_refused(layer, kind):
-    with pytest.raises(TypeError, match=f"expected a {kind} .*, got Hartley"):
-        EstimatorTask(layer)
+    raises(TypeError, f"expected a {kind} .*, got Hartley", EstimatorTask, layer)
 
 
 def test_untrained_weights_are_not_written(tmp_path):
     trainer = make_trainer(tmp_path, [ExportWeights()], max_steps=3, limit_train_batches=0)
-    with pytest.raises(ValueError, match="ended before its first step"):
-        trainer.fit(normaliser_task(), make_data())
+    raises(ValueError, "ended before its first step", trainer.fit, normaliser_task(), make_data())
     assert not (tmp_path / "weights.safetensors").exists()

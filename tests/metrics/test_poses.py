@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from scenes import raises
 
 from kornia_learnnorm.metrics.poses import mean_average_accuracy as maa
 from kornia_learnnorm.metrics.poses import pose_auc, pose_error
@@ -110,7 +111,5 @@ def test_exceptions(summary):
         (torch.rand(3, 1), r"a \(P,\) tensor of at least one pair, got shape \[3, 1\]"),
         (torch.tensor([1.0, NAN, -1.0]), "got 2 NaN or negative ones"),
     ]:
-        with pytest.raises(ValueError, match=message):
-            summary(errors)
-    with pytest.raises(ValueError, match="thresholds must be positive"):
-        pose_auc(torch.ones(3), (5, -1))
+        raises(ValueError, message, summary, errors)
+    raises(ValueError, "thresholds must be positive", pose_auc, torch.ones(3), (5, -1))

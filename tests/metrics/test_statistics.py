@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scenes import raises
 
 from kornia_learnnorm.metrics.statistics import better_rate, bootstrap_interval, median, paired_bootstrap
 
@@ -112,8 +113,7 @@ def test_exceptions():
         (better_rate, (torch.rand(3, 2), torch.rand(3, 2)), r"two \(S,\) tensors, got \[3, 2\] and \[3, 2\]"),
         (better_rate, (torch.rand(0), torch.rand(0)), "none of 0 samples can be compared"),
     ]:
-        with pytest.raises(ValueError, match=message):
-            function(*arguments)
+        raises(ValueError, message, function, *arguments)
 
 
 @pytest.mark.parametrize("number", [1, 2, 5, 8])
@@ -143,8 +143,7 @@ def test_counts(pairs):
     finite = [(a, b) for a, b in pairs if a == a and b == b and not a == b == INF]
     residual, baseline = torch.tensor(pairs).unbind(-1)
     if not finite:
-        with pytest.raises(ValueError, match=f"none of {len(pairs)} samples can be compared"):
-            better_rate(residual, baseline)
+        raises(ValueError, f"none of {len(pairs)} samples can be compared", better_rate, residual, baseline)
         return
     found = better_rate(residual, baseline)
     assert found.rate == sum(a < b for a, b in finite) / len(finite)

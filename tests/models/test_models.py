@@ -7,7 +7,7 @@ from kornia.geometry import homography as by_kornia
 from kornia.geometry.epipolar import normalize_points
 from pairwise import pairwise
 from references import check_gradients, corner_error, signless, up_to_sign
-from scenes import correspondences, plane, uniform
+from scenes import correspondences, plane, raises, uniform
 
 import kornia_learnnorm as kln
 from kornia_learnnorm import GemanMcClure
@@ -127,10 +127,8 @@ def test_wrong_options():
     points, eye = uniform(20, 2), torch.eye(3)
     with pytest.raises(ValueError, match=r"K1 and K2 .* got a homography"):
         kln.RANSAC(model="homography")(points, points, K1=eye, K2=eye)
-    with pytest.raises(ValueError, match=r"'fundamental' or 'homography', got 'affine'"):
-        kln.RANSAC(model="affine")
-    with pytest.raises(ValueError, match=r"'sampson' or 'symmetric', got 'one-way'"):
-        Homography("one-way")
+    raises(ValueError, r"'fundamental' or 'homography', got 'affine'", kln.RANSAC, model="affine")
+    raises(ValueError, r"'sampson' or 'symmetric', got 'one-way'", Homography, "one-way")
     with pytest.raises(ValueError, match=r"at least 4 .* got 3"):
         kln.RANSAC(model="homography")(points[:3], points[:3])
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from scenes import store_of
+from scenes import raises, store_of
 
 from kornia_learnnorm.data.images import read_image, stored_pixels
 from kornia_learnnorm.data.store import CorrespondenceStore
@@ -167,21 +167,18 @@ def test_pixels_of_images_that_exif_turns(tmp_path, orientation):
 class TestErrors:
     def test_a_database_is_never_replaced(self, images):
         (images / "written.db").write_text("mine")
-        with pytest.raises(FileExistsError, match=r"written\.db exists already: remove it"):
-            export(images)
+        raises(FileExistsError, r"written\.db exists already: remove it", export, images)
         assert (images / "written.db").read_text() == "mine"
 
     def test_skew_and_unreadable(self, images):
         with pytest.raises(ValueError, match=r"K must have no skew, .* got 5\.0"):
             export(images, K=K + np.array([[0, 5, 0], [0, 0, 0], [0, 0, 0]]))
         (images / NAMES[1]).write_bytes(b"")
-        with pytest.raises(ValueError, match=r"views/1\.png is not an image that can be read"):
-            export(images)
+        raises(ValueError, r"views/1\.png is not an image that can be read", export, images)
 
     def test_missing_image(self, images):
         (images / NAMES[2]).unlink()
-        with pytest.raises(FileNotFoundError, match=r"1 of 4 images are not in .*, the first is views/2\.png"):
-            export(images)
+        raises(FileNotFoundError, r"1 of 4 images are not in .*, the first is views/2\.png", export, images)
 
     @pytest.mark.parametrize(
         ("broken", "message"),
@@ -195,6 +192,5 @@ class TestErrors:
             Image.new("L", (320, 240)).save(images / NAMES[1])
         else:
             (images / NAMES[1]).write_bytes(broken)
-        with pytest.raises(ValueError, match=message):
-            export(images, turned=broken is None)
+        raises(ValueError, message, export, images, turned=broken is None)
         assert not [*images.glob("*.db*"), *images.glob(".*")]  # nothing is left

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from references import epipolar_distances
+from scenes import raises
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.datasets.frames import FramePair
@@ -146,8 +147,7 @@ class TestErrors:
             ({"matcher": "lightglue"}, ValueError, "lightglue needs detector .*, keynet, got sift"),
             ({"detector": "disk", "matcher": "lightglue", "ratio": 0.7}, ValueError, "0.7 is for matcher nearest"),
         ]:
-            with pytest.raises(error, match=message):
-                estimate_pair("left.png", "right.png", **options)
+            raises(error, message, estimate_pair, "left.png", "right.png", **options)
 
     def test_wrong_masks(self, images):
         with pytest.raises(TypeError, match="a mask must be an array of bool, got uint8"):
@@ -163,8 +163,7 @@ class TestErrors:
             ("no.png", FileNotFoundError, r"no\.png does not exist"),
             ("half.png", ValueError, r"half\.png.*truncated or corrupt"),
         ]:
-            with pytest.raises(error, match=message):
-                estimate_pair(images[0], planes / image if isinstance(image, str) else image)
+            raises(error, message, estimate_pair, images[0], planes / image if isinstance(image, str) else image)
 
 
 @pytest.mark.parametrize(

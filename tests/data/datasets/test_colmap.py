@@ -4,6 +4,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 from make_sequences import SIZE, names
+from scenes import raises
 
 from kornia_learnnorm.data.datasets.colmap import read_colmap
 from kornia_learnnorm.data.datasets.pairing import covisible_pairs
@@ -52,26 +53,22 @@ class TestReadColmap:
             ("PINHOLE 320 240 130 130 160 120", r"0\.png must have its camera's size, 320 x 240 .* got 160 x 120"),
         ]:
             set_camera(colmap, camera)
-            with pytest.raises(ValueError, match=message):
-                read(colmap)
+            raises(ValueError, message, read, colmap)
 
     def test_missing_and_unreadable_images(self, colmap):
         (colmap / "images/one/1.png").write_bytes(b"")
         assert [frame.size for frame in read(colmap)] == [SIZE, (0, 0), SIZE, SIZE]
         shutil.rmtree(colmap / "images/two")
-        with pytest.raises(FileNotFoundError, match=r"2 of 4 images are not in .*images, the first is two/2\.png"):
-            read(colmap)
+        raises(FileNotFoundError, r"2 of 4 images are not in .*images, the first is two/2\.png", read, colmap)
 
     def test_missing_file(self, colmap):
         (colmap / "model" / "points3D.txt").unlink()
-        with pytest.raises(FileNotFoundError, match=r"no COLMAP model at .*model: it lacks points3D\.bin or"):
-            read(colmap)
+        raises(FileNotFoundError, r"no COLMAP model at .*model: it lacks points3D\.bin or", read, colmap)
 
     @pytest.mark.parametrize(("name", "text"), [("cameras", "hello\n"), ("points3D", "1 0 0 1 0 0 0 0.5 77 0 2 9\n")])
     def test_malformed(self, colmap, name, text):
         (colmap / "model" / f"{name}.txt").write_text(text)
-        with pytest.raises(ValueError, match=r"the COLMAP model .*model cannot be read: "):
-            read(colmap)
+        raises(ValueError, r"the COLMAP model .*model cannot be read: ", read, colmap)
 
 
 class TestCovisiblePairs:
@@ -87,8 +84,7 @@ class TestCovisiblePairs:
 
     def test_errors(self, colmap):
         frames = read(colmap)
-        with pytest.raises(ValueError, match="at least 1 point, got min_points 0"):
-            list(covisible_pairs(colmap / "model", frames, 0))
+        raises(ValueError, "at least 1 point, got min_points 0", list, covisible_pairs(colmap / "model", frames, 0))
         path = colmap / "model" / "images.txt"
         path.write_text(path.read_text().replace("one/0.png", "one/9.png"))
         with pytest.raises(ValueError, match=r"no image 'one/0\.png' among the 4 of the model"):

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from make_sequences import blobs, centroids, texture
+from scenes import raises
 
 from kornia_learnnorm.data.datasets.frames import Frame, FramePair, read_frame, resize_frames
 
@@ -84,10 +85,8 @@ class TestReadFrame:
         assert np.abs(centroids(image, want, int(14 * max(size[0] / 240, size[1] / 180))) - want).max() < 0.05
 
     def test_wrong_size_or_camera(self, tmp_path):
-        with pytest.raises(ValueError, match="positive width and height, got 5 x -1"):
-            resize_frames([], (5, -1))
+        raises(ValueError, "positive width and height, got 5 x -1", resize_frames, [], (5, -1))
         frame = frame_of(tmp_path / "a.png", texture())
         with pytest.raises(ValueError, match=r"a\.png has 240 x 180 pixels, its camera 640 x 480"):
             read_frame(replace(frame, size=(640, 480)))
-        with pytest.raises(ValueError, match="a distortion, but no camera matrix"):
-            read_frame(replace(frame, distortion=DISTORTION))
+        raises(ValueError, "a distortion, but no camera matrix", read_frame, replace(frame, distortion=DISTORTION))

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from make_sequences import FOCAL, FR1, FR3, FRAMES, KITTI_K, SIZE, STEP, TUM_START, edit, moved, names
+from scenes import raises
 
 from kornia_learnnorm.data.datasets.frames import Frame
 from kornia_learnnorm.data.datasets.pairing import choose_pairs, listed_pairs, pair_frames
@@ -110,8 +111,7 @@ def test_malformed(written, tmp_path, file, line, text, message, error):
         shutil.rmtree(root / file)
     else:
         (root / file).unlink()
-    with pytest.raises(error, match=message):
-        read_dataset(dataset, root)
+    raises(error, message, read_dataset, dataset, root)
 
 
 def test_wrong_arguments(written):
@@ -129,8 +129,7 @@ def test_wrong_arguments(written):
         ("tum", f"tum/{FR3}", {"split": "train"}, FileNotFoundError, f"expected others than {FR3}, got {FR3}"),
         ("tum", f"tum/{FR1}", {"split": "val"}, FileNotFoundError, f"no val sequence of tum .*: expected {FR3}, got"),
     ]:
-        with pytest.raises(error, match=message):
-            read_dataset(dataset, written / root, **arguments)
+        raises(error, message, read_dataset, dataset, written / root, **arguments)
 
 
 def test_a_folder_within_does_not_part_its_sequence_and_hidden_files_are_none(tmp_path):
@@ -153,8 +152,7 @@ class TestPairFrames:
         assert names(pair_frames(numbered("x", "y"), gap)) == expected
 
     def test_all_pairs_and_a_wrong_gap(self):
-        with pytest.raises(ValueError, match="at least 1, got 0"):
-            list(pair_frames(numbered("x"), 0))
+        raises(ValueError, "at least 1, got 0", list, pair_frames(numbered("x"), 0))
         pairs, text = choose_pairs(numbered("x", "y"), gap=None)
         assert text == "all pairs"
         assert len({frozenset(both) for both in names(pairs)}) == len(pairs) == 8 * 7 / 2
@@ -174,5 +172,4 @@ class TestListedPairs:
             ("\nx/0.png 7.png", r"line 2: no frame '7\.png' among 4, such as 'x/0\.png'"),
         ]:
             (tmp_path / "pairs.txt").write_text(text)
-            with pytest.raises(ValueError, match=message):
-                list(listed_pairs(numbered("x"), tmp_path / "pairs.txt"))
+            raises(ValueError, message, list, listed_pairs(numbered("x"), tmp_path / "pairs.txt"))

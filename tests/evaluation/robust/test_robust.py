@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scenes import shaken_estimator
+from scenes import raises, shaken_estimator
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
@@ -192,8 +192,7 @@ def test_learned_relative_pose_takes_cameras_and_scores(tmp_path):
     unknown = drawn._replace(K=drawn.K * torch.nan)
     assert run_estimator(find_estimator(name), unknown, 0, 1.0).F_mat.isnan().all()
     assert robust_estimators.identify_estimator(f"{name}+scores").startswith(f"{name}+scores ")
-    with pytest.raises(ValueError, match="refined by themselves"):
-        find_estimator(f"{name}+LM")
+    raises(ValueError, "refined by themselves", find_estimator, f"{name}+LM")
 
 
 def test_the_seed_decides():
@@ -217,8 +216,7 @@ def test_unknown():
         ("RANSAC:Hartley+LM", ValueError, "refines by itself"),
         ("RANSAC:nothing", FileNotFoundError, "no weights 'nothing'"),
     ]:
-        with pytest.raises(error, match=message):
-            find_estimator(name)
+        raises(error, message, find_estimator, name)
 
 
 def test_names(tmp_path):
@@ -226,7 +224,6 @@ def test_names(tmp_path):
     short = ["learned:mine", "learned:mine+scores", "RANSAC:mine", "poselib", "RANSAC:kornia_learnnorm:Whitening"]
     names = [name.replace("mine", path) for name in short]
     assert [*robust_estimators.estimator_names(names).values()] == short
-    with pytest.raises(ValueError, match="same name"):
-        robust_estimators.estimator_names(["RANSAC", "RANSAC"])
+    raises(ValueError, "same name", robust_estimators.estimator_names, ["RANSAC", "RANSAC"])
     kinds = ("poselib", "RANSAC:crossview", "learned:robust", "opencv-lmeds")
     assert [*filter(robust_estimators.is_slow, kinds)] == ["poselib", "RANSAC:crossview"]
