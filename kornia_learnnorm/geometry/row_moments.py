@@ -42,4 +42,4 @@ def normal_equations(M: Tensor, pull: Tensor, tangents: Tensor) -> tuple[Tensor,
 _PAIRS = torch.triu_indices(3, 3)
 # From the different entries of a symmetric matrix, (3, 3) and of rows (9, 9), to all of them.
 ENTRIES = torch.eye(6, dtype=torch.float64)[torch.tensor([[0, 1, 2], [1, 3, 4], [2, 4, 5]])]
-_ROW_ENTRIES = torch.einsum("pqs,abt->stpaqb", ENTRIES, ENTRIES).reshape(36, 81)
+_ROW_ENTRIES = torch.einsum("pqs,abt->stpaqb", ENTRIES, ENTRIES).reshape(36, 81).contiguous()
