@@ -1,5 +1,6 @@
 """Reading a dataset by its name, or a folder of images, and naming the ground truth that is missing."""
 
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,15 +23,17 @@ SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", "
 def read_folder(root: str | Path) -> list[Frame]:
     """Return the images of a folder and its subfolders as frames by folder and name, each folder a sequence.
 
-    Images have the suffix png, jpg, jpeg, bmp, tif, tiff, webp, pgm or ppm, whatever the case; hidden files and folders
-    are skipped. A folder without images is a FileNotFoundError.
+    Numbers in names count as numbers: 9.png comes before 10.png. Links to folders are not followed. Images
+    have the suffix png, jpg, jpeg, bmp, tif, tiff, webp, pgm or ppm, whatever the case; hidden files and folders are
+    skipped. A folder without images is a FileNotFoundError.
     """
     root = Path(root)
     paths = [path for path in root.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file()]
     names = [name for name in (path.relative_to(root).as_posix() for path in paths) if "/." not in f"/{name}"]
     if not names:
         raise FileNotFoundError(f"no images ({', '.join(sorted(SUFFIXES))}) in {root}")
-    names.sort(key=lambda name: (name.rpartition("/")[0], name))
+    numbered = {name: [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)] for name in names}
+    names.sort(key=lambda name: (name.rpartition("/")[0], numbered[name], name))
     return [Frame(root / name, name, name.rpartition("/")[0], image_size(root / name)) for name in names]
 
 

@@ -133,12 +133,12 @@ def test_wrong_arguments(written):
 
 
 def test_a_folder_within_does_not_part_its_sequence_and_hidden_files_are_none(tmp_path):
-    for name in ("s/1.png", "s/2/1.png", "s/3.png", "s-1/1.png", "s/.thumbs/1.png", "s/._1.png"):
+    for name in ("s/1.png", "s/2/1.png", "s/10.png", "s/3.png", "s-1/1.png", "s/.thumbs/1.png", "s/._1.png"):
         (tmp_path / name).parent.mkdir(exist_ok=True, parents=True)
         (tmp_path / name).touch()
-    assert names(pair_frames(read_folder(str(tmp_path)))) == [("s/1.png", "s/3.png")]
+    assert names(pair_frames(read_folder(str(tmp_path)))) == [("s/1.png", "s/3.png"), ("s/3.png", "s/10.png")]
     assert [(frame.name, frame.size) for frame in read_folder(tmp_path / "s-1")] == [("1.png", (0, 0))]
-    assert len(read_folder(tmp_path)) == 4
+    assert len(read_folder(tmp_path)) == 5
 
 
 def numbered(*sequences: str) -> list[Frame]:
