@@ -17,7 +17,7 @@ from torch.export import Dim, ExportedProgram
 
 from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.estimators.learned_homography import LearnedHomography
-from kornia_learnnorm.estimators.learned_layer import LearnedLayer
+from kornia_learnnorm.estimators.learned_layer import FORMAT, LearnedLayer
 from kornia_learnnorm.estimators.learned_relative_pose import LearnedRelativePose
 from kornia_learnnorm.estimators.linear import EightPoint
 from kornia_learnnorm.normalizers.learned_normalizer import FORMAT as NORMALIZER_FORMAT
@@ -45,7 +45,7 @@ def load_layer(name: str | Path) -> EightPoint | LearnedLayer:
     module, path = own_weights(name)
     file_format = weights_format(path)
     if file_format is None:
-        known = ", ".join(shipped_weights())
+        known = ", ".join(shipped_weights(NORMALIZER_FORMAT) + shipped_weights(FORMAT))
         raise FileNotFoundError(f"no weights {str(name)!r}: expected a .safetensors file or one of {known}")
     if file_format == NORMALIZER_FORMAT:
         return EightPoint(LearnedNormalizer.from_pretrained(path, [module] if module else ())).eval()
