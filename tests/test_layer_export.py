@@ -199,5 +199,5 @@ def test_load_layer():
     kinds = {"tiny": kln.LearnedEightPoint, "pose": kln.LearnedRelativePose, "homography": kln.LearnedHomography}
     assert all(isinstance(load_layer(f"robust-{name}"), kind) for name, kind in kinds.items())
     assert load_layer("crossview").normalizer.max_points == 12
-.* robust(?!.*refiner)", load_layer, "rubust")
+    raises(FileNotFoundError, r"'rubust'.* crossview.* robust(?!.*refiner)", load_layer, "rubust")
     raises(ValueError, r"\.safetensors", load_layer, __file__)
