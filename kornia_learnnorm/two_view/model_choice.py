@@ -23,8 +23,9 @@ def choose_model(
     """Return the choice, and the fundamental matrix and the homography (3, 3) where they were sought and found.
 
     With ``"auto"`` it is the homography where one, with a radial distortion, explains most inliers of the fundamental
-    matrix, the parallax of the others is no more than chance (as in L. Moisan, B. Stival, IJCV 2004), and the
-    homography has the smaller GRIC; then random parts of the matches are not searched for a better fundamental matrix.
+    matrix, the parallax of the others is no more than chance (as in L. Moisan, B. Stival, IJCV 2004), and, unless the
+    cameras are known, the homography has the smaller GRIC; where it has, random parts of the matches are not searched
+    for a better fundamental matrix.
     It is the homography, too, where this search has failed: it found none, or one with fewer than three quarters of the
     homography's inliers, all of which agree with some fundamental matrix.
     """
@@ -40,7 +41,7 @@ def choose_model(
         return ModelChoice(model, ASKED, parallax, homography_inliers=agree), None, H_mat
     found = solver.solve()
     choice = _compare(solver, found.matrix, H_mat, size1, size2)
-    if choice.model == "fundamental" or choice.by_gric is None:
+    if choice.model == "fundamental" or choice.by_gric != "homography":
         try:
             found = solver.search(found, size2)
         except NoReliableMatrixError as error:
@@ -64,7 +65,9 @@ def _compare(solver: TwoViewSolver, F_mat: Tensor, H_mat: Tensor | None, size1: 
         reason = f"{agree} matches agree on it, only {inliers} on a fundamental matrix"
         return ModelChoice("homography", reason, parallax, inliers, agree)
     gric = compute_gric(*matches, F_mat, H_mat, threshold, solver.cameras is not None)
-    model = "homography" if parallax.planar and gric[1] < gric[0] else "fundamental"
+    # With cameras, a plane has two poses: its homography gives both, an essential matrix one, which may be the wrong.
+    planar = parallax.planar and (solver.cameras is not None or gric[1] < gric[0])
+    model = "homography" if planar else "fundamental"
     if parallax.planar and model == "fundamental":
         reason += ", but GRIC prefers the fundamental matrix"
     return ModelChoice(model, reason, parallax, inliers, agree, *gric)

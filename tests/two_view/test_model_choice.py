@@ -1,5 +1,7 @@
 """Searches among many outliers and near planes, and which of both matrices is the answer."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -43,8 +45,11 @@ class TestChooseModel:
         """Where parallax is no more than chance but F explains the matches better, it stays, with its warning."""
         monkeypatch.setattr(model_choice, "measure_parallax", lambda *_: Parallax(1.0, 1.0, 0.0))
         for relief, model in ((0.1, "fundamental"), (0.0, "homography")):
-            choice = choose_model(make_solver(relief), "auto", SIZE, SIZE)[0]
+            solver, K = make_solver(relief), torch.tensor([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]]).double()
+            choice = choose_model(solver, "auto", SIZE, SIZE)[0]
             assert (choice.model, choice.by_gric) == (model, model)
+            # of known cameras, whose essential matrix would be one of two
+            assert choose_model(replace(solver, cameras=(K, K)), "auto", SIZE, SIZE)[0].model == "homography"
 
     def test_what_is_asked_for(self):
         solver = make_solver(0.0)
