@@ -36,8 +36,9 @@ class ImageSets(StoreSets):
         jitter: largest standard deviation of the displacement that is added, pixels.
         symmetries: flip and transpose images and matches at random, both views alike.
 
-    The attribute ``left_out`` counts pairs without images of their names and shapes. FileNotFoundError if a store or a
-    folder does not exist; ValueError if no pair is left, or an argument is out of its range.
+    Where the images were undistorted for matching, the files must be undistorted too. The attribute ``left_out`` counts
+    pairs without images of their names and shapes. FileNotFoundError if a store or a folder does not exist; ValueError
+    if no pair is left, or an argument is out of its range.
     """
 
     def __init__(

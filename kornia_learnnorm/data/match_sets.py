@@ -19,7 +19,7 @@ class MatchSets(NamedTuple):
 
     points1: Tensor  # (B, N, 2)
     points2: Tensor  # (B, N, 2)
-    heldout1: Tensor  # (B, M, 2), not in the set; true inliers where the ground truth is known; M may be 0
+    heldout1: Tensor  # (B, M, 2), of the same pair; true inliers where the ground truth is known; M may be 0
     heldout2: Tensor  # (B, M, 2)
     pair: Tensor  # (B,) int64, index of the image pair in its source
     scores: Tensor | None = None  # (B, N), from 0 to 1, as 1 minus Lowe's ratio

@@ -74,8 +74,9 @@ def _maps(batch_size: int, generator: Generator) -> tuple[Tensor, Tensor]:
 
 def _wrong_partners(points2: Tensor, generator: Generator) -> Tensor:
     """Return other points in the second view: another point's partner, or the own one shifted by 5-150 px."""
-    shape = (*points2.shape[:2], 1)
-    index = (uniform(shape, 0.0, 1.0, generator) * shape[1]).long().clamp(max=shape[1] - 1).expand_as(points2)
+    shape, others = (*points2.shape[:2], 1), points2.shape[1] - 1
+    further = (uniform(shape, 0.0, 1.0, generator) * others).long().clamp(max=others - 1) + 1  # than the own one
+    index = ((torch.arange(shape[1])[:, None].to(further) + further) % shape[1]).expand_as(points2)
     angle = uniform(shape, 0.0, 2 * math.pi, generator)
     length = log_uniform(shape, 5.0, 150.0, generator)
     shifted = points2 + (length * torch.cat([angle.cos(), angle.sin()], -1)).to(points2)
@@ -95,7 +96,7 @@ class StoreSets:
 
     Args:
         paths: store files, or some pairs of them as ``file.h5@3:10``; environment variables are filled in.
-        num_heldout: further matches of the pair.
+        num_heldout: matches of the pair that are drawn beside the set; some can be in it too.
         max_ratios: limits of Lowe's ratio, of which each draw takes one; None for no limit.
         labels: use the ground truth where there is one; pairs without are supervised by their own matches.
     """

@@ -160,6 +160,7 @@ class TestAugment:
         F_mat = torch.linalg.inv(moved.K2).mT @ moved.E_mat @ torch.linalg.inv(moved.K1)
         assert kln.symmetric_epipolar_distance(moved.heldout1, moved.heldout2, F_mat).max() < 1e-3
         kept = moved.inliers > 0
+        assert torch.equal(kept, (moved.points2 == moved.heldout2).all(-1))  # a false match has another partner
         assert kln.symmetric_epipolar_distance(moved.points1, moved.points2, F_mat)[kept].max() < 1e-3
         assert kept.double().mean() > 0.55
 
