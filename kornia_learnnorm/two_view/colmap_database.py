@@ -174,11 +174,8 @@ def _estimate(
     number = int(inliers.sum())
     if number < MIN_INLIERS or log_false_alarms(len(scores), number, widest, pair.sizes[1]) > MAX_LOG_FALSE_ALARMS:
         return None
-    H_mat = (
-        RANSAC(model="homography", max_samples=PLANE_SAMPLES, **options)
-        .estimate(*(value[inliers] for value in matches))
-        .F_mat
-    )
+    plane = RANSAC(model="homography", max_samples=PLANE_SAMPLES, **options)
+    H_mat = plane.estimate(*(value[inliers] for value in matches)).F_mat
     on_plane = transfer_distance(points1[inliers][None], points2[inliers][None], H_mat[None]) < widest
     matrices, pose, config = {"F": F_mat, "H": H_mat}, None, "UNCALIBRATED"
     if K is not None:

@@ -167,9 +167,12 @@ def _read_done(path: Path) -> dict[FilePair, Line]:
         return {}
     texts = [text for text in path.read_text(encoding="utf-8").splitlines(keepends=True) if text.endswith("\n")]
     lines = {}
-    for line in (_parse(path, text) for text in texts):
-        if UNREADABLE not in [why["code"] for why in line["warnings"]]:
-            lines[Path(line["image1"]["file"]), Path(line["image2"]["file"])] = line
+    try:
+        for line in (_parse(path, text) for text in texts):
+            if UNREADABLE not in [why["code"] for why in line["warnings"]]:
+                lines[Path(line["image1"]["file"]), Path(line["image2"]["file"])] = line
+    except (LookupError, TypeError) as error:  # of a line that this command did not write
+        raise ValueError(f"{path} is damaged: remove it and estimate again: {error!r}") from error
     write_text(path, "".join(json.dumps(line, allow_nan=False) + "\n" for line in lines.values()))
     return lines
 

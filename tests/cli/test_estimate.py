@@ -158,8 +158,9 @@ class TestManyPairs:
         assert solved == first.splitlines()[0]
         assert [warning["code"] for warning in json.loads(failed)["warnings"]] == ["blank"]
         assert json.loads(failed)["image2"] == {"file": "late.png", "width": WIDTH, "height": HEIGHT}
-        path.write_text("{}}\n")
-        raises(ValueError, r"pairs\.jsonl is damaged: remove it", command, *options, images=())
+        for text in ("{}}\n", "{}\n", "3\n"):
+            path.write_text(text)
+            raises(ValueError, r"pairs\.jsonl is damaged: remove it", command, *options, images=())
 
     @pytest.mark.parametrize(("options", "pairs"), [([], 2), (["--gap", "2"], 1), (["--exhaustive"], 3)])
     def test_a_folder(self, planes, command, options, pairs):
