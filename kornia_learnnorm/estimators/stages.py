@@ -117,8 +117,8 @@ class Refinement:
         self.samples, self.settle = samples if searched else 0, settle
         self.few_outliers: Tensor | None = None
         self.all_settled = False
-        few = problem.weights is not None or problem.x1.shape[1] <= model.min_points
-        self.minimal = _solve_minimal(model, problem, frame, self.x1, self.x2) if few else None
+        can_be_minimal = problem.weights is not None or problem.x1.shape[1] <= model.min_points
+        self.minimal = _solve_minimal(model, problem, frame, self.x1, self.x2) if can_be_minimal else None
 
     def __call__(self, M: Tensor, logits: Tensor, steps: int, last: bool = False) -> tuple[Tensor, Tensor]:
         """Return a stage's matrices after so many steps, and its logits."""

@@ -35,6 +35,7 @@ THRESHOLD = 2.0  # pixels, of RANSAC
 INLIER_FACTOR = 2.0  # thresholds within which a match is an inlier: a few coarse ones are better than broken tracks
 MIN_INLIERS = 15  # of a verified pair, COLMAP's own number
 PLANAR_SHARE = 0.8  # of the inliers on one homography, COLMAP's own number
+MAX_SKEW = 1e-6  # of the focal length, by rounding
 PLANE_SAMPLES = 512  # are far more than it takes to find one of so many
 Array = NDArray[np.float64]
 
@@ -116,7 +117,7 @@ def export_colmap(
         raise FileNotFoundError(f"{len(missing)} of {len(names)} images are not in {images}, the first is {missing[0]}")
     camera = None
     if K is not None:
-        if K[0, 1] != 0:
+        if abs(K[0, 1]) > MAX_SKEW * K[0, 0]:
             raise ValueError(f"K must have no skew, as COLMAP's PINHOLE has none, got {K[0, 1]}")
         camera = np.asarray(K / K[2, 2]) + np.array([[0, 0, CORNER], [0, 0, CORNER], [0, 0, 0]])
     pairs = _read_pairs(store, images, turned)

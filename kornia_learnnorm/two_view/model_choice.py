@@ -14,6 +14,7 @@ from kornia_learnnorm.two_view.predicted_error import MEDIAN_SQUARE, MIN_NOISE, 
 from kornia_learnnorm.two_view.result import ModelChoice, NoReliableMatrixError
 from kornia_learnnorm.two_view.solver import MIN_MATCHES, Solution, TwoViewSolver
 
+MIN_PLANE_SUPPORT = 0.9  # of the inliers of an essential matrix, which outliers agree with more easily
 ASKED = "asked for"
 
 
@@ -23,9 +24,9 @@ def choose_model(
     """Return the choice, and the fundamental matrix and the homography (3, 3) where they were sought and found.
 
     With ``"auto"`` it is the homography where one, with a radial distortion, explains most inliers of the fundamental
-    matrix, the parallax of the others is no more than chance (as in L. Moisan, B. Stival, IJCV 2004), and, unless the
-    cameras are known, the homography has the smaller GRIC; where it has, random parts of the matches are not searched
-    for a better fundamental matrix.
+    matrix, the parallax of the others is no more than chance (as in L. Moisan, B. Stival, IJCV 2004), and the
+    homography has the smaller GRIC; then random parts of the matches are not searched for a better fundamental matrix.
+    With cameras, nine tenths of the essential matrix's inliers are enough in the place of GRIC.
     It is the homography, too, where this search has failed: it found none, or one with fewer than three quarters of the
     homography's inliers, all of which agree with some fundamental matrix.
     """
@@ -66,8 +67,8 @@ def _compare(solver: TwoViewSolver, F_mat: Tensor, H_mat: Tensor | None, size1: 
         return ModelChoice("homography", reason, parallax, inliers, agree)
     gric = compute_gric(*matches, F_mat, H_mat, threshold, solver.cameras is not None)
     # With cameras, a plane has two poses: its homography gives both, an essential matrix one, which may be the wrong.
-    planar = parallax.planar and (solver.cameras is not None or gric[1] < gric[0])
-    model = "homography" if planar else "fundamental"
+    as_many = solver.cameras is not None and agree >= MIN_PLANE_SUPPORT * inliers
+    model = "homography" if parallax.planar and (as_many or gric[1] < gric[0]) else "fundamental"
     if parallax.planar and model == "fundamental":
         reason += ", but GRIC prefers the fundamental matrix"
     return ModelChoice(model, reason, parallax, inliers, agree, *gric)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kornia.geometry.epipolar import cross_product_matrix
 from references import true_essential
-from scenes import scenes, seeded
+from scenes import raises, scenes, seeded
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.match_sets import MatchSets
@@ -145,8 +145,7 @@ def test_wrong_options():
         ({"sizes": (3, 9)}, "at least 4 matches"),
         ({"batches": 0}, "at least 1, got 0"),
     ]:
-        with pytest.raises(ValueError, match=message):
-            RandomSets(**{"sources": [SyntheticSets()]} | arguments)
+        raises(ValueError, message, RandomSets, **{"sources": [SyntheticSets()]} | arguments)
 
 
 class TestAugment:

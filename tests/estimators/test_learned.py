@@ -361,8 +361,7 @@ class TestFiles:
                 kln.LearnedEightPoint.from_pretrained(file)
         with pytest.raises(ValueError, match=r"crossview: .* LearnedEightPoint.* LearnedNormalizer"):
             kln.LearnedEightPoint.from_pretrained("crossview")
-        with pytest.raises(TypeError, match="expected a name or a path of weights, got None"):
-            kln.LearnedEightPoint.from_pretrained(None)
+        raises(TypeError, "expected a name or a path of weights, got None", kln.LearnedEightPoint.from_pretrained, None)
 
     @siblings
     def test_starts_from_an_eight_point_estimator(self, kind):

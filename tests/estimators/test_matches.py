@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 from kornia.feature import LightGlue
-from scenes import uniform
+from scenes import raises, uniform
 from torch.nn.utils.rnn import pad_sequence
 from torch.testing import assert_close
 
@@ -113,8 +113,7 @@ def test_wrong_matches_and_scores():
         (FIRST, [torch.rand(1)], ValueError, "scores .* got 1 for 2 pairs"),
         (FIRST, [torch.rand(1), -torch.rand(1)], ValueError, "scores of pair 1 must be finite and not negative"),
     ]:
-        with pytest.raises(error, match=message):
-            correspondences_from_matches(*KEYPOINTS, matches, scores)
+        raises(error, message, correspondences_from_matches, *KEYPOINTS, matches, scores)
 
 
 def test_wrong_keypoints():

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pairwise import pairwise
 from references import eight_point, epipolar_distances
-from scenes import SCENES, correspondences, shaken, uniform
+from scenes import SCENES, correspondences, raises, shaken, uniform
 
 from kornia_learnnorm import Hartley, ReweightedWhitening, Whitening
 from kornia_learnnorm.evaluation.searched_normalizer import SearchedNormalizer
@@ -23,8 +23,7 @@ def mean_distances(points1, points2, normalizer) -> np.ndarray:
 
 
 def test_exceptions():
-    with pytest.raises(ValueError, match="steps must be positive, got 0"):
-        SearchedNormalizer(steps=0)
+    raises(ValueError, "steps must be positive, got 0", SearchedNormalizer, steps=0)
 
 
 @pairwise(base=BASES, scene=SCENES, num_points=[8, 20])

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 from references import epipolar_distances, homogeneous, numpy_sampson
-from scenes import ORIGIN, ROWS, SCENES, correspondences, plane, scenes, uniform
+from scenes import ORIGIN, ROWS, SCENES, correspondences, plane, raises, scenes, uniform
 from torch.autograd import gradcheck
 
 import kornia_learnnorm as kln
@@ -86,8 +86,7 @@ def test_exceptions(distance):
         (POINTS, POINTS, None, TypeError, "[FH]_mat must be .* got <class 'NoneType'>"),
         (POINTS, POINTS, MATRICES.float(), TypeError, "one dtype"),
     ]:
-        with pytest.raises(error, match=message):
-            distance(points1, points2, matrices)
+        raises(error, message, distance, points1, points2, matrices)
 
 
 @pytest.mark.long

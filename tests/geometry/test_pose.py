@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 from kornia.geometry.epipolar import essential_from_fundamental, motion_from_essential_choose_solution
 from references import cross
-from scenes import SCENES, scenes, uniform
+from scenes import SCENES, raises, scenes, uniform
 
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.metrics.poses import pose_error
@@ -94,5 +94,4 @@ class TestRelativePose:
             (lambda F, K1, K2, a, b: (F, K1, K2, a, b, a[0] > 0), ValueError, r"shape \[3, 10\] .*got \[10, 2\]"),
             (lambda F, K1, K2, a, b: (F, 0 * K1, K2, a, b), torch.linalg.LinAlgError, "singular"),
         ]:
-            with pytest.raises(error, match=message):
-                relative_pose(*change(*pair("orbit", 3, 10)[0]))
+            raises(error, message, relative_pose, *change(*pair("orbit", 3, 10)[0]))

@@ -5,7 +5,7 @@ import pytest
 import references as ref
 import torch
 from pairwise import pairwise
-from scenes import correspondences, scenes, uniform
+from scenes import correspondences, raises, scenes, uniform
 from torch.autograd import gradcheck, gradgradcheck
 
 from kornia_learnnorm import Hartley, Whitening, find_fundamental
@@ -150,5 +150,4 @@ class TestResults:
         assert fit.cost[3] == torch.inf
         zero = constrained_fit(scorer.x1, scorer.x2, torch.zeros_like(F0), [squared_loss])
         assert not bool(zero.F_mat.isfinite().any())
-        with pytest.raises(ValueError, match="needs a loss for each step, got none"):
-            constrained_fit(scorer.x1, scorer.x2, F0, [])
+        raises(ValueError, "needs a loss for each step, got none", constrained_fit, scorer.x1, scorer.x2, F0, [])

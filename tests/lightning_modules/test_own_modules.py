@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from scenes import correspondences, rewrite_weights
+from scenes import correspondences, raises, rewrite_weights
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
@@ -98,10 +98,10 @@ def test_weights_come_back_where_the_module_is_trusted(weights):
 def test_nothing_is_imported_without_trust(weights, monkeypatch):
     monkeypatch.delitem(sys.modules, "own_modules")
     message = r"own_modules\.PointNetwork is not of this package.*own_modules=\['own_modules'"
-    with pytest.raises(ValueError, match=message):
-        kln.LearnedNormalizer.from_pretrained(weights)
-    with pytest.raises(ValueError, match="is not of this package"):
-        kln.LearnedNormalizer.from_pretrained(weights, own_modules="my_own_modules")
+    raises(ValueError, message, kln.LearnedNormalizer.from_pretrained, weights)
+    for trusted in (["os"], "my_own_modules"):
+        with pytest.raises(ValueError, match="is not of this package"):
+            kln.LearnedNormalizer.from_pretrained(weights, own_modules=trusted)
     assert "own_modules" not in sys.modules
 
 

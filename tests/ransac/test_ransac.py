@@ -13,7 +13,7 @@ from kornia.geometry import ransac as kornia_ransac
 from kornia.geometry.linalg import transform_points
 from pairwise import pairwise
 from references import epipolar_distances, up_to_sign
-from scenes import one_scene, shaken, uniform
+from scenes import one_scene, raises, shaken, uniform
 
 import kornia_learnnorm as kln
 from kornia_learnnorm import RANSAC
@@ -114,8 +114,7 @@ class TestExceptions:
             *(({"normalizer": n}, TypeError, end) for n, end in (("a", "got 'a'$"), ("homography", "model="))),
             ({"inl_th": "1"}, TypeError, "inl_th must be a number, got '1'"),
         ]:
-            with pytest.raises(error, match=message):
-                RANSAC(**wrong)
+            raises(error, message, RANSAC, **wrong)
 
     @both
     def test_correspondences(self, calibrated):

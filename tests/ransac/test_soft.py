@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 from pairwise import pairwise
 from references import eight_point, numpy_hartley, numpy_sampson, numpy_whitening, up_to_sign
-from scenes import DTYPES, correspondences, seeded, uniform
+from scenes import DTYPES, correspondences, raises, seeded, uniform
 from torch.autograd import gradcheck
 
 from kornia_learnnorm import Hartley, Whitening
@@ -71,8 +71,7 @@ class TestSampleMinimalSets:
             (torch.full((1, 9), -torch.inf), 1, ValueError, "logits must be finite, got 9"),
             (torch.ones(1, 9), 0, ValueError, "count must be >= 1, got 0"),
         ]:
-            with pytest.raises(error, match=message):
-                sample_minimal_sets(logits, count)
+            raises(error, message, sample_minimal_sets, logits, count)
 
 
 class TestExpectedLoss:

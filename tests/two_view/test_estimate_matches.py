@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 from references import epipolar_distances
-from scenes import seeded, uniform
+from scenes import raises, seeded, uniform
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld
+from kornia_learnnorm.metrics.poses import pose_error
 from kornia_learnnorm.two_view import estimate_matches as module
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
@@ -179,6 +180,18 @@ def test_no_matrix():
         assert caught.value.code == code
 
 
+@pytest.mark.parametrize("seed", [4, 8, 13])
+def test_a_plane_seen_by_known_cameras(seed):
+    """Its few matches have two poses, and an essential matrix is that of either; the homography has both."""
+    rng = np.random.default_rng(seed)
+    R, t = cv2.Rodrigues(0.05 * rng.normal(size=3))[0], rng.normal(size=3) * [0.6, 0.2, 0.2]
+    views = zip(see_plane(R, t, noise=0.0), rng.uniform(0, SIZES["size1"], (2, 12, 2)), strict=True)
+    x1, x2 = (np.r_[exact[:40] + 0.3 * rng.normal(size=(40, 2)), wrong] for exact, wrong in views)
+    found = kln.estimate_matches(x1, x2, **SIZES, K1=K, K2=K)
+    poses = [found, *([] if found.other_pose is None else [found.other_pose])]
+    assert min(pose_error(pose.R, pose.t, *map(torch.from_numpy, (R, t))) for pose in poses) < 10
+
+
 def test_wrong_arguments():
     points = dict(zip(("points1", "points2"), torch.rand(2, 9, 2) * 100, strict=True))
     for changes, error, message in [
@@ -200,5 +213,4 @@ def test_wrong_arguments():
         ({"K1": torch.eye(3)}, ValueError, "given together"),
         ({"K1": torch.eye(3), "K2": torch.eye(3)[None]}, ValueError, r"K2 must have .* got \[1, 3, 3\]"),
     ]:
-        with pytest.raises(error, match=message):
-            kln.estimate_matches(**{**points, **changes})
+        raises(error, message, kln.estimate_matches, **{**points, **changes})

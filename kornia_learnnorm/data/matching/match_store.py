@@ -179,8 +179,8 @@ def _match_rest(
             with workers.results(_detect, ((frame, options) for frame in missing)) as found:
                 for frame, detected in zip(missing, found, strict=True):
                     held[frame.name] = Path(features, f"{len(held)}.npz")
-                    _keep(held[frame.name], frame, detected)
-            tasks = ((pairs[i], *(_kept(held[frame.name]) for frame in pairs[i]), options, i) for i in places)
+                    _write_features(held[frame.name], frame, detected)
+            tasks = ((pairs[i], *(_read_features(held[frame.name]) for frame in pairs[i]), options, i) for i in places)
             with workers.results(_match, tasks) as results:
                 for place, result in zip(places, results, strict=True):
                     yield place, result
@@ -213,7 +213,7 @@ def _match(pair: FramePair, features1: Found, features2: Found, options: MatchOp
         return str(error)
 
 
-def _keep(path: Path, frame: Frame, found: Found) -> None:
+def _write_features(path: Path, frame: Frame, found: Found) -> None:
     """Write the features of a frame, or the reason why it has none; OSError on a full disk."""
     arrays: dict[str, Any] = {"reason": found} if isinstance(found, str) else found._asdict()
     try:
@@ -222,7 +222,7 @@ def _keep(path: Path, frame: Frame, found: Found) -> None:
         raise OSError(f"cannot write the features of {frame.name}, is the disk full? {error}") from error
 
 
-def _kept(path: Path) -> Found:
+def _read_features(path: Path) -> Found:
     with np.load(path) as data:
         if "reason" in data:
             return str(data["reason"])

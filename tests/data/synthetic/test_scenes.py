@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 from references import cross, epipolar_distances, homogeneous, unit
-from scenes import seeded
+from scenes import raises, seeded
 
 from kornia_learnnorm.data.synthetic import draws, forward_driving, handheld, orbit, random_scenes
 
@@ -140,5 +140,4 @@ def test_wrong_arguments(make):
             make(**{"batch_size": 2, "num_points": 8, "generator": seeded(), name: wrong})
     for name, wrong in (("noise", (-0.5, np.nan, np.inf)), ("outliers", (-0.1, 1.5, np.nan))):
         for value in wrong if make in NAMED else ():
-            with pytest.raises(ValueError, match=f"{name} .* {value}"):
-                make(2, 8, seeded(), **{name: value})
+            raises(ValueError, f"{name} .* {value}", make, 2, 8, seeded(), **{name: value})

@@ -7,7 +7,7 @@ import pytest
 import torch
 from pairwise import pairwise
 from references import numpy_hartley, numpy_whitening
-from scenes import DTYPES, prepared, shaken, uniform
+from scenes import DTYPES, prepared, raises, shaken, uniform
 from torch.autograd import gradcheck
 from torch.nn.functional import layer_norm
 
@@ -76,8 +76,7 @@ class TestArchitecture:
 
     @pytest.mark.parametrize(("width", "depth"), [(2, 12), (128, 1), (0, 0)])
     def test_exceptions(self, width, depth):
-        with pytest.raises(ValueError, match=f"width >= 3 and depth >= 2, got {width} and {depth}"):
-            PaperNetwork(width, depth)
+        raises(ValueError, f"width >= 3 and depth >= 2, got {width} and {depth}", PaperNetwork, width, depth)
 
 
 @pairwise(size=[(16, 3), (128, 12)], name=["driving", "handheld"], num_points=[8, 30], weighted=[False, True])
