@@ -133,7 +133,7 @@ def stored_pixels(path: Path, points: Array, size: Sequence[int], turned: bool =
         if image_size(path) == (0, 0):
             raise ValueError(f"{path} is not an image that can be read")
         with open_image(path) as image:
-            turn = _orientation(image)
+            turn = image.tag_v2.get(ORIENTATION, 1) if image.format == "TIFF" else _orientation(image)
     x, y = np.asarray(points, np.float64).T
     width, height = map(int, size)
     if turn in QUARTER_TURNS:

@@ -185,5 +185,5 @@ def check_scores(scores: Tensor, points1: Tensor, mask: Tensor | None) -> Tensor
     scores = scores if mask is None else torch.where(mask, scores, 0.0)
     if read_condition(~((scores >= 0) & (scores <= 1)).all()):
         low, high = scores.aminmax()
-        raise ValueError(f"scores must be between 0 and 1, got {low.item():g} to {high.item():g}")
+        raise ValueError(f"scores must be between 0 and 1, got {low.item():.9g} to {high.item():.9g}")
     return scores

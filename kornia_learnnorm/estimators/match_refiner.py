@@ -17,6 +17,7 @@ from kornia_learnnorm.geometry.checks import (
     inference_mode,
     read_condition,
 )
+from kornia_learnnorm.geometry.distances import without_autocast
 from kornia_learnnorm.pretrained import check_architecture, load_module, save_module
 
 FORMAT = "kornia_learnnorm.match_refiner.v1"
@@ -129,7 +130,7 @@ class MatchRefiner(nn.Module):
             the matches in the dtype of the points.
 
         Raises:
-            TypeError: if an argument is no tensor of the right kind.
+            TypeError: if an argument is no tensor of the right kind, or the weights are of half precision.
             ShapeError: if an argument does not have its shape.
             ValueError: if numbers of images and points differ, or a value is not finite or out of its range.
         """
@@ -141,8 +142,11 @@ class MatchRefiner(nn.Module):
         check_correspondences(views[0], views[1], min_points=0)
         for name, image in (("image1", image1), ("image2", image2)):
             _check_image(name, image, len(points1))
-        start = [points.to(self.shift.weight.dtype) for points in views]
-        with inference_mode():
+        dtype = self.shift.weight.dtype
+        if dtype not in (torch.float32, torch.float64):
+            raise TypeError(f"the refiner's weights must be float32 or float64, which hold pixels, got {dtype}")
+        start = [points.to(dtype) for points in views]
+        with inference_mode(), without_autocast(points1):
             frames = local_frames(start[0], start[1], mask)
             half, log_scale = self._move(image1, image2, start, frames)
             for _ in range(self.passes - 1):

@@ -39,6 +39,7 @@ NEAR, EARLY_NEAR_SCALE, LAST_NEAR_SCALE, SETTLED_SCALE = 3.0, 4.2, 1.0, 4.4
 SCALE_BOUND = 1.5  # the logarithm of the factor stays within plus and minus this
 LAST_POWER = 0.1  # of the weights in the last stage: most matches are to count, and a robust loss drops outliers
 RELAXATION = 1.3  # of a step: the curvature of a robust loss is less than its weights
+MAX_RAY = 1e3  # of the features, which the networks overflow beyond
 EARLY_PIXELS, LAST_PIXELS = 2.0, 0.7  # scales of the losses that candidates are compared by
 PIXEL_FLOOR = 1e-3  # pixels, added to distances before their logarithm
 MIN_WEIGHT = 1e-6  # added to weights of which the largest is one
@@ -90,7 +91,7 @@ def run_pose_stages(
         weights = weights if problem.weights is None else weights * problem.weights
         suggested = weights if factor is None else weights * factor
         found.append(logits)
-        if len(found) == len(networks) or is_known_true(settled.all()):
+        if len(found) == len(networks) or (is_known_true(settled.all()) and len(settled) > 0):
             break
         with torch.no_grad():  # the states of least weighted cost among those that the weights suggest
             spans = _moment_spans(evidence, model, suggested[:, None])
@@ -120,7 +121,7 @@ def _rays(frame: CommonFrame, model: Essential, x1: Tensor, x2: Tensor) -> Tenso
     """Return the directions of both points and the frame's unit in pixels as features, (B, N, 5)."""
     rays = torch.stack([model.C1 @ x1, model.C2 @ x2], 1)
     rays = torch.where(frame.swapped[:, None, None, None], rays.flip(1), rays)
-    rays = rays[:, :, :2] / rays[:, :, 2:]
+    rays = (rays[:, :, :2] / rays[:, :, 2:]).clamp(-MAX_RAY, MAX_RAY)
     unit = (frame.inverse[:, :1, :1] / 100).log().expand(-1, 1, rays.shape[-1])
     return torch.cat([rays.flatten(1, 2), unit], 1).mT
 

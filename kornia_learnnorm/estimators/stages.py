@@ -135,7 +135,8 @@ class Refinement:
         """Return which sets need no stage but the first and its refinement, (B,) bool; None if all stages are run."""
         if self.settle and self.samples:
             self.few_outliers = few_outliers(logits, None if self.weights is None else self.weights > 0)
-            self.all_settled = is_known_true(self.few_outliers.all())
+            # Without determined sets the stages are run, so that all networks get gradients, of zero.
+            self.all_settled = is_known_true(self.few_outliers.all()) and len(self.few_outliers) > 0
         return self.few_outliers
 
     def optimize(self, M: Tensor, probability: Tensor, steps: int, last: bool) -> Tensor:

@@ -59,13 +59,13 @@ def symmetric_epipolar_distance(points1: Tensor, points2: Tensor, F_mat: Tensor)
         tensor([[4.]])
     """
     _check(points1, points2, F_mat)
-    with _without_autocast(points1):
+    with without_autocast(points1):
         right = left_to_right_epipolar_distance(points1, points2, F_mat)
         distance = right + right_to_left_epipolar_distance(points1, points2, F_mat)
         return torch.where(_on_epipole(points1, F_mat) | _on_epipole(points2, F_mat.mT), torch.inf, distance)
 
 
-def _without_autocast(points: Tensor) -> AbstractContextManager[object]:
+def without_autocast(points: Tensor) -> AbstractContextManager[object]:
     """Return a context in which autocast is off: pixels have more digits than its dtypes hold."""
     device = points.device.type
     return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
@@ -92,7 +92,7 @@ def sampson_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
         tensor([[1.4142]])
     """
     _check(points1, points2, F_mat)
-    with _without_autocast(points1):
+    with without_autocast(points1):
         return sampson_epipolar_distance(points1, points2, F_mat, squared=False)
 
 
@@ -112,7 +112,7 @@ def algebraic_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tenso
     _check(points1, points2, F_mat)
     F_mat = F_mat / F_mat.norm(dim=(-2, -1), keepdim=True)
     x1, x2 = convert_points_to_homogeneous(points1), convert_points_to_homogeneous(points2)
-    with _without_autocast(points1):
+    with without_autocast(points1):
         return torch.einsum("...ni,...ij,...nj->...n", x2, F_mat, x1).abs()
 
 
@@ -138,7 +138,7 @@ def transfer_distance(points1: Tensor, points2: Tensor, H_mat: Tensor) -> Tensor
         tensor([[2.2361]])
     """
     _check(points1, points2, H_mat, "H_mat")
-    with _without_autocast(points1):
+    with without_autocast(points1):
         distance: Tensor = symmetric_transfer_error(points1, points2, H_mat, squared=False)
     return distance
 

@@ -223,11 +223,12 @@ DEGENERATE = {
     "no motion": lambda p: (p, p),
     "zero": lambda p: (0 * p, 0 * p),
     "unrelated": lambda p: (p, p.flip(1)),
+    "absent and far": lambda p: (torch.cat([p[:, 2:], 1e35 + 0 * p[:, :2]], 1), p.flip(1)),
     "huge": lambda p: (1e12 * p, 1e12 * (p.flip(1) + p)),
 }
 DETERMINED = {
-    "pose": ["no motion", "unrelated", "huge"],
-    "homography": ["four places", "no motion", "unrelated", "huge"],
+    "pose": ["no motion", "unrelated", "absent and far", "huge"],
+    "homography": ["four places", "no motion", "unrelated", "absent and far", "huge"],
 }
 
 
@@ -235,8 +236,9 @@ DETERMINED = {
 @pytest.mark.parametrize("name", DEGENERATE)
 def test_finite_on_degenerate_sets(kind, name):
     points = [p.clone().requires_grad_() for p in DEGENERATE[name](uniform(3, 12, 2, high=600))]
-    layer = LAYERS[kind]()
-    found = layer.estimate(*points, *inputs(kind, 3, 12)[2:])
+    layer = LAYERS[kind]().float()  # the numbers that overflow first
+    near = (points[0].detach().amax(-1) < 1e20).double()
+    found = layer.estimate(*points, *inputs(kind, 3, 12)[2:], weights=near)
     assert found.determined.any() == (name in DETERMINED[kind])
     matrices = [getattr(found, key) for key in MATRICES[kind]]
     loss = signless(found[0]).sum() + sum(value.sum() for value in matrices[1:]) + found.weights.sum()
@@ -280,6 +282,13 @@ def test_every_parameter_gets_a_gradient(kind, number, options):
     gradients = torch.cat([parameter.grad.flatten() for parameter in layer.parameters()])
     assert gradients.isfinite().all()
     assert bool(gradients.any()) == (number > 8)
+
+
+@every
+def test_every_parameter_gets_a_gradient_of_zero_from_undetermined_sets(kind):
+    layer, (points1, points2, *cameras) = CLASSES[kind].from_pretrained(), inputs(kind, 3, 20)
+    signless(layer(0 * points1, 0 * points2, *cameras)).sum().backward()
+    assert not torch.cat([parameter.grad.flatten() for parameter in layer.parameters()]).any()
 
 
 @pytest.mark.parametrize(

@@ -168,6 +168,13 @@ def test_a_second_pass_is_that_of_the_moved_points():
         assert not torch.allclose(found, before)
 
 
+def test_autocast_changes_nothing():
+    refiner, values = trained().float(), [value.float() for value in inputs()]
+    with torch.autocast("cpu", torch.bfloat16):
+        found = refiner(*values)
+    torch.testing.assert_close(found, refiner(*values), rtol=0, atol=0)
+
+
 @pytest.mark.parametrize("passes", [1, 2])
 def test_gradcheck(passes):
     image1, image2, points1, points2 = inputs(num_points=3)
@@ -211,6 +218,7 @@ def test_exceptions():
         raises(error, match, refiner, *wrong)
     refiner.passes = 0
     raises(ValueError, "passes must be a whole number, at least 1, got 0", refiner, image1, image2, points1, points2)
+    raises(TypeError, "must be float32 or float64, .* got torch.float16", trained().half(), *inputs())
     for name, value, text in (
         ("patch_size", 8, "odd"),
         ("patch_size", 3, "5, got"),

@@ -148,19 +148,21 @@ def test_a_pair_that_comes_twice(images):
     assert export(images, store)[0].pairs == 5
 
 
+@pytest.mark.parametrize("suffix", ["png", "tif"])  # Pillow itself turns a TIFF
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_pixels_of_images_that_exif_turns(tmp_path, orientation):
+def test_pixels_of_images_that_exif_turns(tmp_path, orientation, suffix):
     """Against Pillow: the one bright pixel of a file, and where it is shown."""
+    file = tmp_path / f"turned.{suffix}"
     values = np.zeros((5, 7), np.uint8)
     values[1, 2] = 255
     exif = Image.Exif()
     exif[0x0112] = orientation
-    Image.fromarray(values).save(tmp_path / "turned.png", exif=exif)
-    shown = read_image(tmp_path / "turned.png")
+    Image.fromarray(values).save(file, exif=exif)
+    shown = read_image(file)
     (place,) = np.argwhere(shown)
-    stored, size = stored_pixels(tmp_path / "turned.png", place[None, ::-1], shown.shape[::-1])
+    stored, size = stored_pixels(file, place[None, ::-1], shown.shape[::-1])
     assert (stored.tolist(), size) == ([[2, 1]], (7, 5))
-    same, size = stored_pixels(tmp_path / "turned.png", [[2, 1]], (7, 5), turned=False)
+    same, size = stored_pixels(file, [[2, 1]], (7, 5), turned=False)
     assert (same.tolist(), size) == ([[2, 1]], (7, 5))
 
 
