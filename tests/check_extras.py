@@ -1,7 +1,4 @@
-"""Install the wheel with each extra in an empty environment and use what the extra brings; ``make check-extras``.
-
-Arguments are names of extras, ``core`` for none; without arguments, all of them are checked.
-"""
+"""Install the wheel with the extras named, ``core`` for none, or with each, and use what they bring."""
 
 import os
 import subprocess

@@ -1,8 +1,4 @@
-"""Images for tests, and tiny image sequences in the layouts that the readers know.
-
-A camera moves along a textured wall that it faces: frame ``n`` is a window of the texture, ``STEP * n`` pixels further
-to the right. Cameras and poses are exact, but for the distortion of TUM's first two Kinects.
-"""
+"""Tiny sequences that the readers know: frame ``n`` is a window of a wall, ``STEP * n`` pixels to the right."""
 
 from functools import cache
 from itertools import pairwise

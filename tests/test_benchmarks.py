@@ -22,7 +22,6 @@ from kornia_learnnorm.data.datasets.frames import Frame, FramePair, fundamental_
 from kornia_learnnorm.data.synthetic.random_matches import random_planes
 from kornia_learnnorm.data.synthetic.scenes import synthetic_store
 from kornia_learnnorm.data.writer import write_store
-from kornia_learnnorm.two_view.result import NoReliableMatrixError
 
 pytest.importorskip("cv2")
 import cv2
@@ -89,19 +88,6 @@ class TestPairs:
         # A rotation where the camera moved, and a translation of the wrong sign.
         assert pairs.error_of_pose(case, answer_homography(case, H_mat, R=case.R)) == math.inf
         assert pairs.error_of_pose(case, answer_homography(case, H_mat, R=case.R, t=-case.t)) == pytest.approx(180)
-
-    def test_a_fault_of_the_estimator_is_no_refusal(self, case, capsys):
-        def solve(case):
-            raise error
-
-        error = NoReliableMatrixError("blank", "image 1 is blank")
-        refused = pairs.score(case, solve)
-        assert (refused["refused"], pairs.described(refused)) == ("blank", "refused (blank)")
-        error = ZeroDivisionError("oops")
-        crashed = pairs.score(case, solve)
-        assert pairs.outcome(crashed) == "crashed"
-        assert "oops" in crashed["crashed"]
-        assert "room 0: ZeroDivisionError('oops')" in capsys.readouterr().err
 
     def test_runs(self, tmp_path, capsys):
         arguments = ["--pairs", "3", "--kinds", "plane", "rotation", "outliers", "--size", "160", "120"]
@@ -241,16 +227,14 @@ def test_images_show_the_correspondences(kind, seed):
     assert len(pair.points1) == len(pair.points2) >= 500
     for points in (pair.points1, pair.points2):
         assert ((points >= 0) & (points <= np.array(SIZE) - 1)).all()
-    values = [
-        cv2.remap(cv2.GaussianBlur(image, None, 1.0), points.astype(np.float32)[:, None], None, cv2.INTER_LINEAR)
-        for image, points in ((pair.image1, pair.points1), (pair.image2, pair.points2))
-    ]
+    smooth = [cv2.GaussianBlur(image, None, 1.0) for image in (pair.image1, pair.image2)]
+    places = [x.astype(np.float32)[:, None] for x in (pair.points1, pair.points2)]
+    values = [cv2.remap(smooth[k], places[k], None, cv2.INTER_LINEAR) for k in range(2)]
     assert np.corrcoef(values[0].ravel(), values[1].ravel())[0, 1] > 0.85  # 0 for points that do not correspond
     if kind == "rotation":
         H = pair.K @ pair.R @ np.linalg.inv(pair.K)
         np.testing.assert_allclose(cv2.perspectiveTransform(pair.points1[None], H)[0], pair.points2, atol=1e-9)
         assert np.isnan(pair.F_mat).all()
-        assert pair.t.tolist() == [0, 0, 0]
         assert 3 <= np.degrees(np.arccos((np.trace(pair.R) - 1) / 2)) <= 16
         return
     assert epipolar_distances(pair.points1, pair.points2, pair.F_mat).max() < 1e-6

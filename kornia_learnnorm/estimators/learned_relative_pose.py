@@ -152,7 +152,7 @@ class LearnedRelativePose(LearnedLayer):
         r"""Return essential matrices, poses, the weights of the correspondences and what each stage gives.
 
         Arguments, shapes and errors are those of :meth:`~kornia_learnnorm.LearnedEightPoint.estimate`, with
-        :math:`N \ge 5`; the cameras are needed.
+        :math:`N \ge 5`; the cameras are needed, and the points must be pixels.
 
         Returns:
             the matrices, poses, weights and stages, in the dtype of the points. Of the four poses of an essential

@@ -128,7 +128,9 @@ class MatchedPair:
             matches = first.points1, first.points2, first.scores
             found = resolve_ambiguity(first, *false, lambda kept: solve("fundamental", *(x[kept] for x in matches)))
             found = replace(found, choice=first.choice, H_mat=first.H_mat)
-        scale = float(torch.stack([S1.diagonal()[:2], S2.diagonal()[:2]]).mean())
+        # A homography's distances are those in image 2, a fundamental matrix's those in both images.
+        scales = [S2] if found.model == "homography" else [S1, S2]
+        scale = float(torch.stack([S.diagonal()[:2] for S in scales]).mean())
         return replace(
             found,
             F_mat=None if found.F_mat is None else unit_matrix(transform_fundamental(found.F_mat, S1, S2)),

@@ -80,6 +80,9 @@ class TestEstimatePair:
         assert found.points1[:, 0].max() > 240
         assert found.threshold == pytest.approx(WIDTH / 240, rel=0.01)
         assert np.median(distances(result, found.F_mat)) < 0.5
+        first, second = (cv2.imread(str(image)) for image in images)
+        second = cv2.resize(second, None, fx=2, fy=2)  # a homography's distances are those in image 2
+        assert estimate_pair(first, second, max_size=WIDTH, model="homography").threshold == 2
 
     def test_refined_matches(self, images, result):
         """An untrained refiner moves nothing; the trained one moves points within its bound, nearer to their lines."""
