@@ -11,7 +11,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from kornia.geometry.linalg import transform_points
 from make_sequences import texture
 from PIL import Image
 from references import epipolar_distances
@@ -42,17 +41,12 @@ def case():
     return pairs.rendered("room", 0, (160, 120), None)
 
 
-def answer(case, F_mat: Tensor, *codes: str, **more) -> SimpleNamespace:
+def answer(case, F_mat: Tensor) -> SimpleNamespace:
     """An estimate, as far as the benchmark reads it."""
-    warnings, inliers = [SimpleNamespace(code=code) for code in codes], torch.ones(len(case.points1), dtype=torch.bool)
-    points = {"points1": case.points1, "points2": case.points2, "inliers": inliers}
+    inliers, choice = torch.ones(len(case.points1), dtype=torch.bool), SimpleNamespace(by_gric="homography")
+    points = {"points1": case.points1, "points2": case.points2, "inliers": inliers, "warnings": [], "choice": choice}
     matrices = {"model": "fundamental", "matrix": F_mat, "F_mat": F_mat, "H_mat": None, "R": None, "t": None}
-    matrices["choice"] = SimpleNamespace(by_gric="homography")
-    return SimpleNamespace(**{**matrices, **points, "warnings": warnings, "predicted_error": 1.0, **more})
-
-
-def answer_homography(case, H_mat: Tensor, **more) -> SimpleNamespace:
-    return answer(case, true_matrix(case), model="homography", matrix=H_mat, H_mat=H_mat, **more)
+    return SimpleNamespace(**matrices, **points, predicted_error=1.0)
 
 
 def true_matrix(case) -> Tensor:
@@ -66,28 +60,11 @@ class TestPairs:
         assert max(record["pose_error"], record["true_error"]) < 1e-6
         assert record["inliers"] == record["matches"] == len(case.points1)
         assert pairs.outcome(record) == "right"
-        flagged = pairs.score(case, lambda case: answer(case, true_matrix(case), "planar"))
-        assert flagged["warnings"] == ["planar"]
-        assert pairs.outcome(flagged) == "right, flagged"
         along_y = case._replace(R=torch.eye(3).double(), t=torch.tensor([0.0, 1.0, 0.0]).double())
         record = pairs.score(case, lambda case: answer(case, true_matrix(along_y)))
-        assert record["pose_error"] > 45
-        assert record["true_error"] > 1
+        assert min(record["pose_error"] / 45, record["true_error"]) > 1
         assert pairs.outcome(record) == "wrong"
         assert pairs.outcome(record | {"warnings": ["planar"]}) == "wrong, flagged"
-
-    def test_right_and_wrong_homographies(self, case):
-        H_mat = case.K @ case.R @ torch.linalg.inv(case.K)
-        turned = case._replace(t=torch.zeros(3).double(), points2=transform_points(H_mat[None], case.points1[None])[0])
-        for R, outcome in ((None, "right"), (case.R, "right"), (torch.diag(torch.tensor([-1.0, -1, 1])), "wrong")):
-            found = answer_homography(turned, H_mat, R=None if R is None else R.double())
-            record = pairs.score(turned, lambda case, found=found: found)
-            assert (pairs.outcome(record), record["model"], record["gric"]) == (outcome, "homography", "homography")
-            assert record["true_error"] < 1e-6
-        assert pairs.outcome(pairs.score(case, lambda case: answer_homography(case, H_mat))) == "wrong"
-        # A rotation where the camera moved, and a translation of the wrong sign.
-        assert pairs.error_of_pose(case, answer_homography(case, H_mat, R=case.R)) == math.inf
-        assert pairs.error_of_pose(case, answer_homography(case, H_mat, R=case.R, t=-case.t)) == pytest.approx(180)
 
     def test_runs(self, tmp_path, capsys):
         arguments = ["--pairs", "3", "--kinds", "plane", "rotation", "outliers", "--size", "160", "120"]
@@ -117,16 +94,12 @@ def test_real_pairs_get_the_same_matches_and_cameras_where_known(case):
 
     records = real_pairs.measure(real_pair, {"poselib": peer}, (8, 20, 0))
     assert [record["size"] for record in records] == [0, 8, 20]
-    assert seen == [(60, 1), (8, 1), (20, 1)]
     assert records[0]["poselib"] < 1e-5
     assert [record["poselib"] for record in records[1:]] == [math.inf] * 2
-    own = records[0]["estimate_pair"]
-    assert (own["model"], own["inliers"]) == ("fundamental", 60)
-    assert own["error"] < 1e-3
-    assert own["true"] < 1e-3
+    assert max(records[0]["estimate_pair"][key] for key in ("error", "true")) < 1e-3
     assert records[1]["estimate_pair"]["refused"] == "few_matches"
-    assert real_pairs.measure(real_pair._replace(calibrated=False), {"poselib": peer}, ())
-    assert seen[-1] == (60, 0)
+    real_pairs.measure(real_pair._replace(calibrated=False), {"poselib": peer}, ())
+    assert seen == [(60, 1), (8, 1), (20, 1), (60, 0)]
 
 
 @pytest.mark.parametrize("backward", [False, True])
@@ -235,6 +208,5 @@ def test_images_show_the_correspondences(kind, seed):
         H = pair.K @ pair.R @ np.linalg.inv(pair.K)
         np.testing.assert_allclose(cv2.perspectiveTransform(pair.points1[None], H)[0], pair.points2, atol=1e-9)
         assert np.isnan(pair.F_mat).all()
-        assert 3 <= np.degrees(np.arccos((np.trace(pair.R) - 1) / 2)) <= 16
         return
     assert epipolar_distances(pair.points1, pair.points2, pair.F_mat).max() < 1e-6

@@ -69,11 +69,8 @@ def test_the_reference_has_every_public_name():
 
 
 def read_table(table):
-    return [
-        [cell.strip() for cell in line.strip("|").split("|")]
-        for line in table.splitlines()
-        if not line.startswith("|:-")
-    ]
+    lines = [line for line in table.splitlines() if not line.startswith("|:-")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
 
 
 @pytest.mark.parametrize("page", [page for page, text in TEXTS.items() if TABLE.search(text)])
@@ -95,14 +92,6 @@ def test_the_readme_has_poses_and_the_picture_of_the_results():
     assert read_table(results_tables.poses_summary().data) in [*map(read_table, tables)]
     source = hashlib.sha256((DOCS / "results/sizes.json").read_bytes()).hexdigest()
     assert source in (DOCS / "images/sizes.svg").read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize("path", RESULTS, ids=lambda path: path.name)
-def test_a_page_shows_each_file_of_results(path):
-    uses = f'"{path.stem}"', f"results/{path.name}", f"{{results}} {path.stem}_"
-    pages = [page for page, text in TEXTS.items() if any(use in text for use in uses)]
-    assert pages
-    assert len([page for page in pages if f'table("{path.stem}")' in TEXTS[page]]) <= 1
 
 
 def lightglue_output():

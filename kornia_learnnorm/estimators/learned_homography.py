@@ -1,4 +1,4 @@
-r"""The learned homography: a matrix between two views of a plane, or of a camera that only turns, from matches."""
+r"""The learned homography: a matrix between two views of a plane, or of a camera that only rotates, from matches."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class HomographyEstimate(NamedTuple):
 
 
 class LearnedHomography(LearnedLayer):
-    r"""Estimate the homography of a plane, or of a camera that only turns, from matches with outliers in one pass.
+    r"""Estimate the homography of a plane, or of a camera that only rotates, from matches with outliers in one pass.
 
     The sibling of :class:`~kornia_learnnorm.LearnedEightPoint` for homographies, differentiable too. Each stage's
     network predicts a logit for every correspondence and two transforms, the weighted DLT follows in their

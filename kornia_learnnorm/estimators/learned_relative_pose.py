@@ -67,7 +67,7 @@ class LearnedRelativePose(LearnedLayer):
     fundamental matrix.
 
     The order of the correspondences has no effect. Swapping the views, with their cameras, gives :math:`E^\top` up to
-    sign. Planes and cameras that move forward are solved as other scenes are; a camera that only turns has no
+    sign. Planes and cameras that move forward are solved as other scenes are; a camera that only rotates has no
     translation, and some direction is returned. Undistort the points before where the distortion is known.
 
     Args:

@@ -135,7 +135,7 @@ def find_homography(
     mask: Tensor | None = None,
     normalizer: Normalizer | None = None,
 ) -> Tensor:
-    r"""Compute the homography from four or more correspondences of a plane, or of a camera that only turns.
+    r"""Compute the homography from four or more correspondences of a plane, or of a camera that only rotates.
 
     The DLT in normalised coordinates, :math:`H = T_2^{-1} \hat H T_1`. Four points determine :math:`H` exactly,
     whatever the weights and the normaliser. Do not use it on matches with outliers: it is least squares.

@@ -52,7 +52,7 @@ def optimal_rank2(F_mat: Tensor, points1: Tensor, points2: Tensor, weights: Tens
         TypeError: if an argument is not a floating-point tensor or the points are not of one dtype.
         ShapeError: if a shape is wrong.
         ValueError: if there are fewer than eight correspondences, shapes do not pair up, a value is not finite, a
-            matrix is zero.
+            weight is negative, a matrix is zero.
 
     Reference:
         K. Kanatani, Y. Sugaya, Fundamental matrix computation: theory and practice, Memoirs of the Faculty of

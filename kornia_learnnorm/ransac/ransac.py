@@ -91,8 +91,10 @@ class RANSAC(nn.Module):
             the root of the sum of both squared transfer errors.
 
     Raises:
-        TypeError: if ``normalizer`` cannot be called, or an argument that must be a number is not one.
-        ValueError: if a number is out of its range, or there is no such ``distance`` or ``rank2``.
+        TypeError: if ``normalizer`` cannot be called, or ``inl_th``, ``confidence``, ``max_seconds`` or ``seed`` is no
+            number.
+        ValueError: if a number is out of its range, ``max_samples`` is not whole, or there is no such ``model``,
+            ``distance`` or ``rank2``.
 
     Reference:
         P. Torr, A. Zisserman, MLESAC, CVIU 2000 (MSAC); O. Chum, J. Matas, J. Kittler, Locally optimized RANSAC, DAGM

@@ -57,7 +57,7 @@ def estimate_matches(
     """Return the fundamental matrix or homography of matches with its predicted error and the reasons to doubt it.
 
     The answer is a homography where the matches do not determine a fundamental matrix, as on a plane or where the
-    camera only turns, see :func:`~kornia_learnnorm.two_view.model_choice.choose_model`. Where less than half of the
+    camera only rotates, see :func:`~kornia_learnnorm.two_view.model_choice.choose_model`. Where less than half of the
     matches are inliers, RANSAC searches again among those near its matrix. Where one homography explains most inliers,
     the matrix of this homography and the parallax of the other matches is tried too.
 

@@ -237,8 +237,7 @@ DETERMINED = {
 def test_finite_on_degenerate_sets(kind, name):
     points = [p.clone().requires_grad_() for p in DEGENERATE[name](uniform(3, 12, 2, high=600))]
     layer = LAYERS[kind]().float()  # the numbers that overflow first
-    near = (points[0].detach().amax(-1) < 1e20).double()
-    found = layer.estimate(*points, *inputs(kind, 3, 12)[2:], weights=near)
+    found = layer.estimate(*points, *inputs(kind, 3, 12)[2:], weights=(points[0].detach().amax(-1) < 1e20).double())
     assert found.determined.any() == (name in DETERMINED[kind])
     matrices = [getattr(found, key) for key in MATRICES[kind]]
     loss = signless(found[0]).sum() + sum(value.sum() for value in matrices[1:]) + found.weights.sum()

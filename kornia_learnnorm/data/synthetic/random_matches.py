@@ -65,7 +65,7 @@ def random_matches(
 def random_planes(
     batch_size: int, num_points: int, num_exact: int, generator: Generator, coarse: float = 0.0
 ) -> SyntheticMatches:
-    """Draw matches of planes, and in a quarter of the scenes of a camera that only turns.
+    """Draw matches of planes, and in a quarter of the scenes of a camera that only rotates.
 
     The plane is slanted by up to about 60 degrees. The camera turns by 0.005-0.7 rad, also about its axis, and moves by
     0.01-1 times the distance of the plane. The second image shows an eighth of the first or more. Noise, outliers and

@@ -37,7 +37,7 @@ class RenderedPair(NamedTuple):
     K: Array  # intrinsics of both cameras, pixels, (3, 3); pixel centres are at whole numbers
     R: Array  # (3, 3)
     t: Array  # metres, (3,)
-    F_mat: Array  # unit norm, (3, 3); NaN where the camera only turns
+    F_mat: Array  # unit norm, (3, 3); NaN where the camera only rotates
     points1: Array  # exact correspondences on the surfaces that both images show, pixels, (M, 2): a grid in image 1
     points2: Array  # their pixels in image 2, (M, 2)
 
@@ -77,7 +77,7 @@ def check_size(seed: int, width: int, height: int) -> None:
 def write_pair(folder: str | Path, pair: RenderedPair) -> None:
     """Write ``image1.png``, ``image2.png`` and ``ground_truth.json`` to a folder, each complete or not at all.
 
-    The ground truth holds ``K``, ``R``, ``t``, ``F_mat`` (null where the camera only turns), ``width`` and ``height``.
+    The ground truth holds ``K``, ``R``, ``t``, ``F_mat`` (null where the camera only rotates), and the size.
     """
     cv2, folder = import_cv2(), Path(folder)
     folder.mkdir(parents=True, exist_ok=True)

@@ -62,13 +62,9 @@ def test_without_ground_truth_there_are_inliers_and_heldout_errors(run, robust_r
         assert not [name for name in table.header if "truth" in name or "F1" in name], title
     rows = {row[0]: row for row in as_text(tables["Inliers: scenes, filtered"].rows)}
     assert rows["whitening"][2].startswith(f"{100 * shares[:, 1].mean():.1f} [")
-    header = tables["Fit and accuracy: scenes, filtered"].header[:4]
-    assert header == ["method", "fit px", "held out px", "condition number"]
     robust.about["stores"]["kitti_06"] = "images of a folder, 3 pairs, 990 matches"
-    table, time, tests = (table.known_parts() for table in robust_tables(robust)[:3])
+    table, time = (table.known_parts() for table in robust_tables(robust)[:2])
     assert table.header == ["estimator", "inliers % @0.1 px", "inliers % @1 px"]
-    assert time.header == ["estimator", "ms @0.1 px", "samples @0.1 px", "ms @1 px", "samples @1 px"]
-    assert tests.header[2:] == ["inliers @0.1 px: change, p", "inliers @1 px: change, p"]
     assert "ground-truth" not in [row[0] for row in (*table.rows, *time.rows)]
 
 
