@@ -66,8 +66,8 @@ def focal_lengths(F_mat: Tensor, principal1: Tensor, principal2: Tensor) -> Foca
         first, second, _ = _products(E)  # their product is the third
         sensitivity = 1 / first.abs() + 1 / second.abs() + 1 / (first * second).abs()
         determined = real & (sensitivity < 2 * MAX_SENSITIVITY)
-    values = (torch.where(determined, focal, torch.nan).to(F_mat.dtype) for focal in (focal1, focal2))
-    return FocalLengths(*values, determined)
+    focal1, focal2 = (torch.where(determined, focal, torch.nan).to(F_mat.dtype) for focal in (focal1, focal2))
+    return FocalLengths(focal1, focal2, determined)
 
 
 def _products(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
