@@ -57,16 +57,18 @@ def focal_lengths(F_mat: Tensor, principal1: Tensor, principal2: Tensor) -> Foca
     eye = torch.eye(2).to(F).expand(len(F), 2, 2)
     T1, T2 = (affine_transform(eye, -points.to(F)) for points in (principal1, principal2))
     F = unit_matrix(transform_fundamental(F, T1, T2))
-    square1, square2 = (_square_of_first(*_products(M)) for M in (F, F.mT))
-    real = (square1 > 0) & (square2 > 0) & (square1 + square2).isfinite()
-    focal1, focal2 = (torch.where(real, square, 1.0).sqrt() for square in (square1, square2))
+    products = [_products(M) for M in (F, F.mT)]
     with torch.no_grad():
+        squares = torch.stack([-a * b / c for a, b, c in products])
+        real = ((squares > 0) & squares.isfinite()).all(0)
+        focal1, focal2 = torch.where(real, squares, 1.0).sqrt()
         scale1, scale2 = (torch.stack([f, f, torch.ones_like(f)], -1) for f in (focal1, focal2))
-        E = unit_matrix(scale2[:, :, None] * F * scale1[:, None])
-        first, second, _ = _products(E)  # their product is the third
-        sensitivity = 1 / first.abs() + 1 / second.abs() + 1 / (first * second).abs()
-        determined = real & (sensitivity < 2 * MAX_SENSITIVITY)
-    focal1, focal2 = (torch.where(determined, focal, torch.nan).to(F_mat.dtype) for focal in (focal1, focal2))
+        a, b, _ = _products(unit_matrix(scale2[:, :, None] * F * scale1[:, None]))  # the third is their product
+        determined = real & (1 / a.abs() + 1 / b.abs() + 1 / (a * b).abs() < 2 * MAX_SENSITIVITY)
+    squares = torch.stack(
+        [torch.where(determined, -a * b / torch.where(determined, c, 1.0), 1.0) for a, b, c in products]
+    )
+    focal1, focal2 = torch.where(determined, squares.sqrt(), torch.nan).to(F_mat.dtype)
     return FocalLengths(focal1, focal2, determined)
 
 
@@ -78,8 +80,3 @@ def _products(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     epipole, _ = smallest_right_singular_vector(F.mT)
     row = epipole[:, 0, None] * F[:, 1] - epipole[:, 1, None] * F[:, 0]
     return row[:, 2], F[:, 2, 2], (row[:, :2] * F[:, 2, :2]).sum(-1)
-
-
-def _square_of_first(first: Tensor, second: Tensor, third: Tensor) -> Tensor:
-    square: Tensor = -first * second / torch.where(third == 0, torch.nan, third)
-    return square
