@@ -1,7 +1,4 @@
-"""The page of ``learnnorm demo`` in a headless Chromium that reaches this computer alone; run, it takes a screenshot.
-
-python tests/demo_browser.py docs/images/demo.jpg
-"""
+"""The page of ``learnnorm demo`` in a headless Chromium that reaches this computer alone; run, it saves a picture."""
 
 import os
 import shutil

@@ -7,10 +7,12 @@ from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
+from kornia.geometry.linalg import transform_points
 from make_sequences import texture
 from PIL import Image
 from references import epipolar_distances
@@ -21,6 +23,7 @@ from kornia_learnnorm.data.datasets.frames import Frame, FramePair, fundamental_
 from kornia_learnnorm.data.synthetic.random_matches import random_planes
 from kornia_learnnorm.data.synthetic.scenes import synthetic_store
 from kornia_learnnorm.data.writer import write_store
+from kornia_learnnorm.two_view.result import NoReliableMatrixError
 
 pytest.importorskip("cv2")
 import cv2
@@ -41,12 +44,16 @@ def case():
     return pairs.rendered("room", 0, (160, 120), None)
 
 
-def answer(case, F_mat: Tensor) -> SimpleNamespace:
+def answer(case, F_mat: Tensor, **more) -> SimpleNamespace:
     """An estimate, as far as the benchmark reads it."""
     inliers, choice = torch.ones(len(case.points1), dtype=torch.bool), SimpleNamespace(by_gric="homography")
     points = {"points1": case.points1, "points2": case.points2, "inliers": inliers, "warnings": [], "choice": choice}
     matrices = {"model": "fundamental", "matrix": F_mat, "F_mat": F_mat, "H_mat": None, "R": None, "t": None}
-    return SimpleNamespace(**matrices, **points, predicted_error=1.0)
+    return SimpleNamespace(**{**matrices, **points, "predicted_error": 1.0, **more})
+
+
+def answer_homography(case, H_mat: Tensor, **more) -> SimpleNamespace:
+    return answer(case, true_matrix(case), model="homography", matrix=H_mat, H_mat=H_mat, **more)
 
 
 def true_matrix(case) -> Tensor:
@@ -65,6 +72,25 @@ class TestPairs:
         assert min(record["pose_error"] / 45, record["true_error"]) > 1
         assert pairs.outcome(record) == "wrong"
         assert pairs.outcome(record | {"warnings": ["planar"]}) == "wrong, flagged"
+
+    def test_right_and_wrong_homographies(self, case):
+        H_mat = case.K @ case.R @ torch.linalg.inv(case.K)
+        turned = case._replace(t=torch.zeros(3).double(), points2=transform_points(H_mat[None], case.points1[None])[0])
+        for R, outcome in ((None, "right"), (case.R, "right"), (torch.diag(torch.tensor([-1.0, -1, 1])), "wrong")):
+            found = answer_homography(turned, H_mat, R=None if R is None else R.double())
+            record = pairs.score(turned, lambda case, found=found: found)
+            assert (pairs.outcome(record), record["model"], record["gric"]) == (outcome, "homography", "homography")
+            assert record["true_error"] < 1e-6
+        assert pairs.outcome(pairs.score(case, lambda case: answer_homography(case, H_mat))) == "wrong"
+        # A rotation where the camera moved, and a translation of the wrong sign.
+        assert pairs.error_of_pose(case, answer_homography(case, H_mat, R=case.R)) == math.inf
+        assert pairs.error_of_pose(case, answer_homography(case, H_mat, R=case.R, t=-case.t)) == pytest.approx(180)
+
+    def test_a_fault_of_the_estimator_is_no_refusal(self, case, capsys):
+        refused = pairs.score(case, Mock(side_effect=NoReliableMatrixError("blank", "image 1 is blank")))
+        assert (refused["refused"], pairs.described(refused)) == ("blank", "refused (blank)")
+        assert pairs.outcome(pairs.score(case, Mock(side_effect=ZeroDivisionError()))) == "crashed"
+        assert "room 0: ZeroDivisionError()" in capsys.readouterr().err
 
     def test_runs(self, tmp_path, capsys):
         arguments = ["--pairs", "3", "--kinds", "plane", "rotation", "outliers", "--size", "160", "120"]
@@ -208,5 +234,6 @@ def test_images_show_the_correspondences(kind, seed):
         H = pair.K @ pair.R @ np.linalg.inv(pair.K)
         np.testing.assert_allclose(cv2.perspectiveTransform(pair.points1[None], H)[0], pair.points2, atol=1e-9)
         assert np.isnan(pair.F_mat).all()
+        assert pair.t.tolist() == [0, 0, 0]
         return
     assert epipolar_distances(pair.points1, pair.points2, pair.F_mat).max() < 1e-6

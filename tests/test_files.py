@@ -14,8 +14,7 @@ from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.files import atomic_write, exclusive
 
 # Without the package, which takes seconds to import.
-HOLD = """
-import runpy, sys
+HOLD = """import runpy, sys
 with runpy.run_path(sys.argv[2])["exclusive"](sys.argv[1]):
     print("held", flush=True)
     sys.stdin.read()

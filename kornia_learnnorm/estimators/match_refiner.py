@@ -16,8 +16,8 @@ from kornia_learnnorm.geometry.checks import (
     check_whole_number,
     inference_mode,
     read_condition,
+    without_autocast,
 )
-from kornia_learnnorm.geometry.distances import without_autocast
 from kornia_learnnorm.pretrained import check_architecture, load_module, save_module
 
 FORMAT = "kornia_learnnorm.match_refiner.v1"

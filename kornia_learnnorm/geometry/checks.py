@@ -175,6 +175,12 @@ def inference_mode() -> AbstractContextManager[object]:
     return nullcontext() if transformed or forward_ad._current_level >= 0 else torch.inference_mode()  # noqa: SLF001
 
 
+def without_autocast(points: Tensor) -> AbstractContextManager[object]:
+    """Return a context in which autocast is off: pixels have more digits than its dtypes hold."""
+    device = points.device.type
+    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
+
+
 def weighted_mean(values: Tensor, weights: Tensor | None) -> Tensor:
     """Average over the points ``(B, N, C) -> (B, C)``; weights that sum to zero count as equal."""
     if weights is None:

@@ -6,8 +6,6 @@ distance in pixels, a function of the squared norms :math:`n_1 = \|(F^\top x_2)_
 :math:`n_2 = \|(F x_1)_{1:2}\|^2` of the epipolar lines' normals. It returns its value and its derivatives by both.
 """
 
-from contextlib import AbstractContextManager, nullcontext
-
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from kornia.geometry.epipolar import (
@@ -18,7 +16,7 @@ from kornia.geometry.epipolar import (
 from kornia.geometry.homography import symmetric_transfer_error
 from torch import Tensor
 
-from kornia_learnnorm.geometry.checks import check_tensor, safe_divisor, weighted_mean
+from kornia_learnnorm.geometry.checks import check_tensor, safe_divisor, weighted_mean, without_autocast
 
 EPIPOLE_TOLERANCE = 1e-12  # length of an epipolar line's normal over that of its summands; rounding leaves less
 
@@ -63,12 +61,6 @@ def symmetric_epipolar_distance(points1: Tensor, points2: Tensor, F_mat: Tensor)
         right = left_to_right_epipolar_distance(points1, points2, F_mat)
         distance = right + right_to_left_epipolar_distance(points1, points2, F_mat)
         return torch.where(_on_epipole(points1, F_mat) | _on_epipole(points2, F_mat.mT), torch.inf, distance)
-
-
-def without_autocast(points: Tensor) -> AbstractContextManager[object]:
-    """Return a context in which autocast is off: pixels have more digits than its dtypes hold."""
-    device = points.device.type
-    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
 
 
 @torch.no_grad()

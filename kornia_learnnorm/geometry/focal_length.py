@@ -23,14 +23,17 @@ class FocalLengths(NamedTuple):
 def focal_lengths(F_mat: Tensor, principal1: Tensor, principal2: Tensor) -> FocalLengths:
     r"""Return the focal lengths that a fundamental matrix gives where principal points are known, in closed form.
 
-    Pixels must be square. The optical axes must not meet, and the epipoles not be near the principal points: a camera
-    that moves forwards, or is turned towards a point that the other camera looks at, too, does not determine them.
+    Pixels must be square. They are not determined where both optical axes meet (both cameras look at one point), or an
+    epipole is near its principal point (a camera moves forwards).
 
     Args:
         F_mat: fundamental matrices with shape :math:`(B, 3, 3)`, any scale.
         principal1: principal points of the first images, pixels, with shape :math:`(B, 2)`; the centre of an image is
             a good guess.
         principal2: principal points of the second images.
+
+    Returns:
+        focal lengths in the dtype of ``F_mat``, solved in float64 where the device has it, and which are determined.
 
     Raises:
         TypeError: if a tensor is not floating-point.

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from kornia_learnnorm.estimators.linear import solve_linear
-from kornia_learnnorm.geometry.checks import check_cameras, check_choice, solve_dtype
+from kornia_learnnorm.geometry.checks import check_cameras, check_choice, solve_dtype, without_autocast
 from kornia_learnnorm.geometry.distinct_points import distinct_points
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem
@@ -205,12 +205,10 @@ class RANSAC(nn.Module):
         cameras = None if K1 is None or K2 is None else (K1, K2)
         least = self.model.min_points if cameras is None else Essential.sample_size
         check_matches(points1, points2, weights, least)
-        device = points1.device.type
         with ExitStack() as stack:
-            if device == "cpu":
+            if points1.device.type == "cpu":
                 stack.enter_context(one_thread())
-            if torch.is_autocast_enabled(device):
-                stack.enter_context(torch.autocast(device, enabled=False))
+            stack.enter_context(without_autocast(points1))
             # Inference mode is faster, but what a normaliser keeps of it would be of no use in training.
             stack.enter_context(torch.inference_mode() if self.normalizer is None else torch.no_grad())
             result = self._estimate(points1, points2, weights, cameras, least)

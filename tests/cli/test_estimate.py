@@ -151,8 +151,7 @@ class TestManyPairs:
         with pytest.raises(ValueError, match=r"results of other options, write elsewhere: ratio \S+, now 0\.7$"):
             command(*options, "--ratio", "0.7", images=())
         path.write_text(first + '{"F": nu')  # as a killed run leaves it
-        # what was unreadable is tried again
-        Path("late.png").write_bytes((planes / "blank.png").read_bytes())
+        Path("late.png").write_bytes((planes / "blank.png").read_bytes())  # what was unreadable is tried again
         assert command(*options, images=()) == 3
         solved, failed = path.read_text().splitlines()
         assert solved == first.splitlines()[0]

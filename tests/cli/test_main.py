@@ -146,8 +146,7 @@ def test_missing_and_wrong_checkpoints(trained, monkeypatch, refused):
 
 
 # The console script in a process where importing torch is interrupted.
-INTERRUPTED_IMPORT = """
-import sys
+INTERRUPTED_IMPORT = """import sys
 
 class Interrupting:
     def find_spec(self, name, path=None, target=None):

@@ -43,8 +43,7 @@ class TestDiagnose:
         points = correspondences(name, 10, num_points, **options)
         found = torch.stack(diagnose(*(p.to(device) for p in points), normalizer), 1).cpu().numpy()
         expected = numpy_diagnose(*points, *normalizer(*points))
-        # In pixels, eigenvalues of A^T A lose twice the digits.
-        loose = isinstance(normalizer, Identity)
+        loose = isinstance(normalizer, Identity)  # In pixels, eigenvalues of A^T A lose twice the digits.
         np.testing.assert_allclose(found[:, 0], expected[:, 0], rtol=1e-2 if loose else 1e-5)
         np.testing.assert_allclose(found[:, 1:], expected[:, 1:], rtol=1e-3 if loose else 1e-6, atol=1e-6)
 

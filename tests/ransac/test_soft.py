@@ -147,8 +147,7 @@ class TestExpectedLoss:
         pairs = torch.cartesian_prod(torch.arange(9), torch.arange(9))
         values = expected_loss(*(p.expand(81, -1, -1) for p in points), sets[pairs], target, scale=1.0, threshold=0.1)
         p = logits[0].softmax(-1)
-        # A set is drawn where its missing point would come last.
-        last = probabilities_to_be_last(p)
+        last = probabilities_to_be_last(p)  # A set is drawn where its missing point would come last.
         exact = (last[pairs[:, 0]] * last[pairs[:, 1]] * values.loss).sum()
         (wanted,) = torch.autograd.grad(exact, logits)
 

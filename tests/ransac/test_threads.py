@@ -1,6 +1,7 @@
 """The number of threads comes back, however the block ends and whoever else is in one."""
 
-from threading import Barrier, Thread
+from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
 
 import pytest
 import torch
@@ -27,26 +28,18 @@ def test_one_inside_and_all_after_an_error_too():
 
 
 def test_callers_that_overlap():
-    barrier, seen = Barrier(2), []
+    barrier = Barrier(2)
 
-    def first():
+    def caller(before, inside):
+        for _ in range(before):
+            barrier.wait()
         with one_thread():
-            barrier.wait()
-            barrier.wait()
-        seen.append(torch.get_num_threads())
+            for _ in range(inside):
+                barrier.wait()
+        return torch.get_num_threads()
 
-    def second():
-        barrier.wait()
-        with one_thread():
-            barrier.wait()
-        seen.append(torch.get_num_threads())
-
-    threads = [Thread(target=first), Thread(target=second)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert seen == [3, 3]
+    with ThreadPoolExecutor() as pool:
+        assert [*pool.map(caller, (0, 1), (2, 1))] == [3, 3]  # the first enters before the second, and leaves with it
     assert torch.get_num_threads() == 3
 
 

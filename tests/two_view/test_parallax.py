@@ -163,8 +163,7 @@ SHIFT = torch.cat([torch.zeros(60), torch.linspace(10, 60, 40)])
     [
         (0 * SHIFT, 0.3, 1.0, True),
         (SHIFT, 0.3, 0.6, False),
-        # Parallax is evidence where the matches fit within much less than it.
-        (1.5 * (SHIFT == 0), 0.3, 0.4, False),
+        (1.5 * (SHIFT == 0), 0.3, 0.4, False),  # Parallax is evidence where the matches fit within much less than it.
         *((0.9 * (SHIFT == 0), distance, 1.0, distance > 0.5) for distance in (0.3, 0.95)),
         *((0.4 * (SHIFT == 0), distance, 1.0, distance > 0.2) for distance in (0.1, 0.5)),
     ],

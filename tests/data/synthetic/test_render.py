@@ -28,8 +28,7 @@ def test_ground_truth_is_that_of_the_cameras(pair):
     np.testing.assert_allclose(pair.R @ pair.R.T, np.eye(3), atol=1e-14)
     assert np.linalg.det(pair.R) == pytest.approx(1)
     assert 0.4 < np.linalg.norm(pair.t) < 0.9
-    # Points in space, projected by hand.
-    X1 = np.random.default_rng(0).uniform((-2, -1, 3), (2, 1, 7), (20, 3))
+    X1 = np.random.default_rng(0).uniform((-2, -1, 3), (2, 1, 7), (20, 3))  # Points in space, projected by hand.
     x1, x2 = X1 @ pair.K.T, (X1 @ pair.R.T + pair.t) @ pair.K.T
     x1, x2 = x1 / x1[:, 2:], x2 / x2[:, 2:]
     assert epipolar_distances(x1[:, :2], x2[:, :2], pair.F_mat).max() < 1e-9
