@@ -37,6 +37,8 @@ TOLERANCE = 1e-6  # cosine of offsets and derivatives at which Levenberg-Marquar
 MIN_PLANAR_SHARE = 0.5  # of the inliers on one homography; below, the scene is no plane
 NOISE = (1.0, 0.5, 0.25, 0.125)  # thresholds; noise that is tried, SIFT errs by 0.1 px or so
 MAX_LOG_CHANCE_PARALLAX = -3.0  # log10 of the expected number of epipoles that chance gives as much parallax
+NEARLY_PLANE = 0.8  # of the inliers within the threshold of one homography; from it on, signs must agree, too
+MIN_SIGNS, MAX_SIGNS = 100, 2000  # matches off the plane; fewer are too far apart to share a side, more are thinned
 AT_INFINITY = 1e6  # halves of the diagonal; offset of a point that the homography moves to infinity
 
 
@@ -69,9 +71,13 @@ def measure_parallax(
     H = find_main_plane(points1[inliers], points2[inliers], threshold)
     if H is None:
         return Parallax(0.0, 0.0, 0.0)
-    off_plane = distances_from_plane(points1, points2, H, size1, size2, threshold)
+    offsets = offsets_from_plane(points1, points2, H, size1, size2, threshold)
+    off_plane = offsets.norm(dim=-1)
     near, wide = (float((off_plane[inliers] < k * threshold).double().mean()) for k in (1, 3))
-    return Parallax(near, wide, min(0.0, parallax_evidence(points1, points2, F_mat, off_plane, threshold)))
+    evidence = parallax_evidence(points1, points2, F_mat, off_plane, threshold)
+    if near >= NEARLY_PLANE and evidence <= MAX_LOG_CHANCE_PARALLAX:
+        evidence = max(evidence, sign_evidence(points1, points2, F_mat, offsets, threshold))
+    return Parallax(near, wide, min(0.0, evidence))
 
 
 def find_main_plane(points1: Tensor, points2: Tensor, threshold: float) -> Tensor | None:
@@ -106,8 +112,8 @@ def parallax_evidence(
     so the two that agree best do not count. Of one epipole, chance gives a ratio of :math:`\Lambda` with a probability
     of at most :math:`1 / \Lambda` (Markov's inequality).
 
-    Matches are pixels (N, 2); ``distance`` is :math:`r`, (N,), that of :func:`parallax` or
-    :func:`distances_from_plane`; ``noises`` are standard deviations, as shares of the threshold.
+    Matches are pixels (N, 2); ``distance`` is :math:`r`, (N,), that of :func:`parallax` or the length
+    of :func:`offsets_from_plane`; ``noises`` are standard deviations, as shares of the threshold.
     """
     across = left_to_right_epipolar_distance(points1[None], points2[None], F_mat[None])[0]
     shares, evidence = torch.arange(0.05, 1.0, 0.1).to(F_mat), math.inf
@@ -121,6 +127,37 @@ def parallax_evidence(
         tests = len(noises) * len(shares) * number * (number - 1) / 2
         evidence = min(evidence, math.log10(tests) - gain / math.log(10))
     return evidence
+
+
+def sign_evidence(points1: Tensor, points2: Tensor, F_mat: Tensor, offsets: Tensor, threshold: float) -> float:
+    """Return log10 of the chance, at most, that errors of matches off the plane agree as much in sign.
+
+    Detectors err along the edges of the image, so that on a facade errors alone have a direction in common (B. Zeisl
+    et al., Estimation of location uncertainty for scale invariant feature points, BMVC 2009), but either sign. Parallax
+    has that of its neighbours. Of the matches off the plane that agree with F, those nearest to each other, further
+    than three thresholds apart, are compared (as in M. Schilling, Multivariate two-sample tests based on nearest
+    neighbors, JASA 1986). These pairs are a forest, so that signs by chance agree independently: Chernoff's bound.
+
+    ``offsets`` (N, 2) are those of :func:`offsets_from_plane`; the noise is any of :data:`NOISE`. Minus infinity where
+    fewer than :data:`MIN_SIGNS` matches can be compared, whatever the noise.
+    """
+    across = left_to_right_epipolar_distance(points1[None], points2[None], F_mat[None])[0]
+    distance, evidence, most = offsets.norm(dim=-1), 0.0, 0
+    for least in (OFF_PLANE * noise * threshold for noise in NOISE):
+        off = ((distance > least) & distance.isfinite() & (across < least)).nonzero()[:, 0]
+        if (number := len(off)) < MIN_PARALLAX_INLIERS:
+            continue
+        most = max(most, number)
+        off = off[:: 1 + number // MAX_SIGNS]
+        apart = torch.cdist(points1[off], points1[off])
+        apart, nearest = apart.where(apart > 3 * threshold, math.inf).min(1)
+        pairs = torch.stack([torch.arange(len(off)), nearest], 1)[apart.isfinite()].sort(1).values
+        pairs = torch.unique(pairs, dim=0)
+        agree = float((offsets[off][pairs].prod(1).sum(-1) > 0).double().mean()) if len(pairs) else 0.0
+        if agree > 0.5:
+            information = sum(share * math.log10(2 * share) for share in (agree, 1 - agree) if share > 0)
+            evidence = min(evidence, math.log10(len(NOISE)) - len(pairs) * information)
+    return evidence if most >= MIN_SIGNS else -math.inf
 
 
 def fit_plane_and_parallax(points1: Tensor, points2: Tensor, H: Tensor, threshold: float, seed: int) -> Tensor | None:
@@ -144,10 +181,10 @@ def fit_plane_and_parallax(points1: Tensor, points2: Tensor, H: Tensor, threshol
     return refine_fundamental(points1[None], points2[None], scorer.to_pixels(found), loss=loss).F_mat[0]
 
 
-def distances_from_plane(
+def offsets_from_plane(
     points1: Tensor, points2: Tensor, H: Tensor, size1: Size, size2: Size, threshold: float
 ) -> Tensor:
-    r"""Return the distances (N,) of points2 from where the plane and a radial distortion move points1, pixels.
+    r"""Return the offsets (N, 2) of points2 from where the plane and a radial distortion move points1, pixels.
 
     A point at the radius :math:`r` from the centre of its image, in halves of the diagonal, is that of a pinhole camera
     at the radius :math:`r (1 + k r^2)`, with one :math:`|k| \le 0.2` for both images. It and the homography (3, 3)
@@ -162,8 +199,8 @@ def distances_from_plane(
     start = _Parameters(torch.cat([(H / torch.linalg.matrix_norm(H)).flatten(), H.new_zeros(1)])[None])
     cost = RobustCost(_BentPlane(), x1, x2, torch.ones_like(x1[:, 0]), GemanMcClure(threshold * float(T2[0, 0])))
     _, optimum = minimize(cost, start, MAX_LM_STEPS, TOLERANCE)
-    distance = cost.squares(optimum.state.matrix())[0].sqrt()
-    return torch.where(distance < AT_INFINITY, distance / T2[0, 0], math.inf)
+    offsets = _BentPlane().linearise(optimum.state.matrix(), x1, x2)[0].view(2, -1).mT
+    return torch.where(offsets.abs() < AT_INFINITY, offsets / T2[0, 0], math.inf)
 
 
 class _Parameters(NamedTuple):

@@ -85,6 +85,35 @@ class TestEvidence:
         assert evidence > module.MAX_LOG_CHANCE_PARALLAX
 
 
+def test_signs_of_neighbours_by_hand():
+    """Of a hundred pairs, on a row, all agree, or all but two; of too few or too near ones, nothing is known."""
+
+    def evidence(signs, gap=20.0):
+        x = (gap * 1.02 ** torch.arange(len(signs))).cumsum(0).double()  # of each, the one before is the nearest
+        points1, offsets = (torch.stack([value, 0 * x], 1) for value in (x, 3 * signs.double()))
+        return module.sign_evidence(points1, points1 + offsets, ROWS, offsets, 1.0)
+
+    one_side, lost = torch.ones(101), 0.98 * math.log10(0.98) + 0.02 * math.log10(0.02)
+    assert evidence(one_side) == pytest.approx(math.log10(4) - 100 * math.log10(2))
+    two = torch.where((torch.arange(101) - 40).abs() < 10, -one_side, one_side)
+    assert evidence(two) == pytest.approx(math.log10(4) - 100 * (math.log10(2) + lost))
+    assert [evidence(one_side[:99]), evidence(one_side, gap=1e-3)] == [-math.inf, 0]
+
+
+@pytest.mark.parametrize("agree", [False, True])
+def test_errors_along_edges_are_no_parallax(agree, monkeypatch):
+    """A tenth of the matches of a plane is off along the rows, to either side, or to that of their neighbours."""
+    rng = np.random.default_rng(0)
+    points = torch.from_numpy(rng.uniform([0, 0], [640, 480], (2000, 2)))
+    signs = torch.where(points[:, 0] < 320, -1.0, 1.0) if agree else torch.from_numpy(rng.choice([-1.0, 1.0], 2000))
+    offsets = torch.stack([2 * signs * (torch.arange(2000) % 10 == 0), torch.zeros(2000)], 1).double()
+    monkeypatch.setattr(module, "find_main_plane", lambda *_: torch.eye(3).double())
+    monkeypatch.setattr(module, "offsets_from_plane", lambda *_: offsets)
+    found = module.measure_parallax(points, points + offsets, ROWS, 1.0, (640, 480), (640, 480))
+    assert found.near == pytest.approx(0.9)
+    assert found.planar != agree
+
+
 def test_main_plane():
     pytest.importorskip("cv2", reason="OpenCV is not installed")
     points = torch.from_numpy(np.random.default_rng(0).uniform([0, 0], [640, 480], (40, 2)))
@@ -115,18 +144,18 @@ def matches(distortion, relief=0.0, noise=0.1, number=300):
     return tuple(p + noise * torch.from_numpy(rng.normal(size=(number, 2))) for p in points)
 
 
-class TestDistancesFromPlane:
+class TestOffsetsFromPlane:
     @pytest.mark.parametrize("distortion", [-0.1, 0.0, 0.15])
     def test_a_bent_plane_is_a_plane(self, distortion):
         points = matches(distortion, noise=0.0)
-        assert module.distances_from_plane(*points, BENT, SIZE, SIZE, 1.0).max() < 1e-3
+        assert module.offsets_from_plane(*points, BENT, SIZE, SIZE, 1.0).norm(dim=1).max() < 1e-3
         if distortion:
             assert module.parallax(*points, BENT).max() > 1
 
     @pytest.mark.parametrize("distortion", [0.0, 0.08])
     def test_parallax_stays(self, distortion):
         points = matches(distortion, relief=10.0)
-        off = module.distances_from_plane(*points, BENT, SIZE, SIZE, 1.0)
+        off = module.offsets_from_plane(*points, BENT, SIZE, SIZE, 1.0).norm(dim=1)
         expected = 10 * np.hypot(1, 0.5) * torch.linspace(-1, 1, 150).abs()
         assert off[1::2].max() < 0.6
         assert (off[::2] / expected)[expected > 2].median() == pytest.approx(1, abs=0.15)
@@ -134,16 +163,16 @@ class TestDistancesFromPlane:
     def test_points_at_infinity(self):
         points1, points2 = matches(0.0)
         points1[0] = torch.tensor([0.0, 50000.0])  # on the line that this homography moves to infinity
-        assert module.distances_from_plane(points1, points2, BENT, SIZE, SIZE, 1.0).isnan().sum() == 0
+        assert module.offsets_from_plane(points1, points2, BENT, SIZE, SIZE, 1.0).isnan().sum() == 0
 
     @given(scale=st.floats(0.1, 10))
     def test_moves_with_the_scale_of_the_images(self, scale):
         points1, points2 = matches(0.05, relief=5.0)
-        expected = module.distances_from_plane(points1, points2, BENT, SIZE, SIZE, 1.0)
+        expected = module.offsets_from_plane(points1, points2, BENT, SIZE, SIZE, 1.0)
         S = torch.diag(torch.tensor([scale, scale, 1.0], dtype=torch.float64))
         size = (SIZE[0] * scale, SIZE[1] * scale)
         moved = scale * points1, scale * points2, S @ BENT @ S.inverse()
-        scaled = module.distances_from_plane(*moved, size, size, scale)
+        scaled = module.offsets_from_plane(*moved, size, size, scale)
         torch.testing.assert_close(scaled, scale * expected, rtol=1e-4, atol=1e-4 * scale)
 
 
@@ -171,7 +200,7 @@ SHIFT = torch.cat([torch.zeros(60), torch.linspace(10, 60, 40)])
 def test_measure_parallax(shift, distance, near, planar, monkeypatch):
     """Of the identity, under which a hundred points stay or move along one direction."""
     monkeypatch.setattr(module, "find_main_plane", lambda *_: torch.eye(3).double())
-    monkeypatch.setattr(module, "distances_from_plane", lambda *_: shift)
+    monkeypatch.setattr(module, "offsets_from_plane", lambda *_: torch.stack([shift, 0 * shift], 1))
     points = torch.from_numpy(np.random.default_rng(0).uniform([0, 0], [640, 480], (100, 2)))
     across = torch.tensor([0, distance / 2], dtype=torch.float64)  # in each image
     found = module.measure_parallax(points, points + across, ROWS, 1.0, (640, 480), (640, 480))
