@@ -10,7 +10,7 @@ from references import signless, up_to_sign
 from scenes import inputs, raises, shaken, shaken_estimator
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.estimators import fundamental_stages, pose_stages
+from kornia_learnnorm.estimators import fundamental_stages, homography_stages, pose_stages
 from kornia_learnnorm.layer_export import export_layer, export_networks, load_layer
 from kornia_learnnorm.pretrained import shipped_weights
 
@@ -37,6 +37,13 @@ for points, given, expected in cases:
     torch.testing.assert_close(tuple(run(*points, **given)), tuple(expected), rtol=1e-4, atol=1e-5)
 assert not [name for name in sys.modules if name.partition(".")[0] in ("kornia_learnnorm", "kornia")]
 """
+
+
+@pytest.fixture(autouse=True)
+def _no_cache_of_shapes():
+    """A third of the time of tracing with sizes that are not known."""
+    with torch._dynamo.config.patch(fake_tensor_cache_enabled=False):
+        yield
 
 
 def sets(batch_size: int, num_points: int, kind: str = "fundamental") -> list[torch.Tensor]:
@@ -95,8 +102,9 @@ def test_any_batch_and_number_of_points_also_without_the_package(tmp_path, monke
 
 @pytest.mark.parametrize(("cls", "kind"), [(kln.LearnedRelativePose, "pose"), (kln.LearnedHomography, "homography")])
 def test_siblings(cls, kind, monkeypatch):
-    for name in ("EARLY_STEPS", "LOCAL_STEPS"):
-        monkeypatch.setattr(pose_stages, name, 1)
+    for module, names in ((pose_stages, ("EARLY_STEPS", "LOCAL_STEPS")), (homography_stages, ("LOCAL_STEPS",))):
+        for name in names:
+            monkeypatch.setattr(module, name, 1)
     layer = cls(width=8, depth=1, refine_steps=1, samples=4)
     program = export_layer(layer, ["scores"]).module()
     for size in SIZES:
