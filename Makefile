@@ -90,12 +90,15 @@ test-cpus: $(VENV)/.ready
 
 CORE_TESTS = tests/geometry tests/models tests/normalizers tests/estimators tests/ransac tests/metrics tests/test_training_losses.py tests/test_files.py
 
+LOWER_BOUNDS = import tomllib; needs = tomllib.load(open("pyproject.toml", "rb"))["project"]["dependencies"]; \
+	print(*(need.replace(">=", "==") for need in needs if not need.startswith("torch>=")), sep="\n")
+
 # Only what the core requires is installed: no filters for warnings of the extras, and no stores to read.
 test-oldest: export OMP_NUM_THREADS = 1
 test-oldest:
 	$(PYTHON) -m venv $(OLDEST)
 	$(OLDEST)/bin/python -m pip install --quiet $(TORCH)
-	$(OLDEST)/bin/python tests/oldest_versions.py > $(OLDEST)/pins.txt
+	$(OLDEST)/bin/python -c '$(LOWER_BOUNDS)' > $(OLDEST)/pins.txt
 	$(OLDEST)/bin/python -m pip install --quiet $(TORCH) --requirement $(OLDEST)/pins.txt pytest pytest-timeout pytest-xdist hypothesis
 	env -u LEARNNORM_DATA $(OLDEST)/bin/python -m pytest $(PARALLEL) -q -o filterwarnings=error -o pythonpath=". tests" $(CORE_TESTS)
 

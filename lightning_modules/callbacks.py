@@ -55,7 +55,9 @@ class Checkpoints(ModelCheckpoint):
         """Save a checkpoint where one is due, or where the training was interrupted, which ends here."""
         super().on_train_batch_end(trainer, pl_module, *args)
         terminated = trainer.received_sigterm and trainer.world_size == 1
-        if self._interrupted or terminated:
+        # Within an accumulation a checkpoint would lose the gradient of its first batches.
+        stepped = (args[2] + 1) % trainer.accumulate_grad_batches == 0 or trainer.is_last_batch
+        if terminated or (self._interrupted and stepped):
             self._save_last(trainer)
             raise SIGTERMException if terminated else KeyboardInterrupt
 

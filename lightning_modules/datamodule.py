@@ -53,7 +53,7 @@ class BatchLoader:
         number = round(len(self._units(self._draw(0, 0))) / max(sizes[0], 1) * sum(sizes))
         if number < (batch_size if self.shuffle else 1):
             raise ValueError(f"a batch takes {batch_size} {unit}s, the source gives {number}")
-        return -(-number // batch_size)
+        return max(-(-number // batch_size), len(sizes))
 
     def __len__(self) -> int:
         return self._length
@@ -63,7 +63,9 @@ class BatchLoader:
         epoch, start = self.epoch, self.batch
         # Batch number i of the epoch belongs to the block whose share of all samples it falls into.
         shares = np.cumsum([0, *self._sizes(epoch)])
-        bounds = [int(bound) for bound in np.rint(shares * (self._length / shares[-1]))]
+        least = np.arange(len(shares))  # each block has one batch or more
+        extra = np.maximum.accumulate(np.rint(shares * (self._length / shares[-1])) - least)
+        bounds = [int(bound) for bound in least + np.minimum(extra, self._length - least[-1])]
         first = max(block for block, bound in enumerate(bounds[:-1]) if bound <= start)
         # The "items" are indices of blocks; the workers draw the blocks as they would collate items.
         blocks: Any = range(first, len(bounds) - 1)
@@ -87,14 +89,16 @@ class BatchLoader:
         self.epoch, self.batch = state["epoch"], state["batch"]
 
     def _cut(self, samples: MatchSets, number: int, epoch: int, block: int) -> Iterator[MatchSets]:
-        """Yield this process's shares of ``number`` batches, or of fewer where the samples are too few."""
+        """Yield this process's shares of ``number`` batches; in evaluation, of fewer where the samples are too few."""
         units = self._units(samples)
         order = torch.arange(len(units))
         if self.shuffle and self.batch_size is not None:
             order = torch.randperm(len(units), generator=block_generator(self._seed(epoch), block, 1))
-        number = min(number, len(units))
+        # Without the last of the announced batches, Lightning skips validation and schedule: some samples come twice.
+        number = number if self.shuffle and len(units) else min(number, len(units))
         for i in range(number):
-            first, stop = len(units) * i // number, len(units) * (i + 1) // number
+            first = len(units) * i // number
+            stop = max(first + 1, len(units) * (i + 1) // number)
             chosen = order[first + self.rank : stop : self.world_size]
             yield samples.select(torch.cat([order[:0], *(units[i] for i in chosen)]) if self.by_pair else chosen)
 

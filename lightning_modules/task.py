@@ -93,7 +93,8 @@ class EstimatorTask(pl.LightningModule):
 
     With :class:`SetLoss`, validation and test log the median distance of the held-out matches by the size of the sets;
     with another loss, the mean log residual of the samples' own points and the better rates against Hartley and
-    whitening. Sets with a NaN or infinite coordinate are left out and counted: ``train/left_out``. A step without any
+    whitening. Sets with a NaN or infinite coordinate, or for a relative pose without cameras, are left out and counted:
+    ``train/left_out``. A step without any
     other set, or with a gradient that is not finite, changes nothing, warns, and is counted: ``train/skipped``; twenty
     in a row are a ValueError.
 
@@ -105,7 +106,7 @@ class EstimatorTask(pl.LightningModule):
             such as :class:`~kornia_learnnorm.EpipolarLoss` or your own; :class:`SetLoss` when not given.
         optimizer: builds the optimiser from the parameters; AdamW with a learning rate of 2e-3 when not given.
         lr_scheduler: builds a schedule that steps once an epoch; when not given, one cycle over all steps of the run
-            up to the optimiser's learning rate.
+            up to the optimiser's learning rate, and of beta 1 where it is 0.9, PyTorch's default.
         warm_up: share of the cycle in which the learning rate rises.
         sample_gradient: largest norm of one set's gradient with respect to the outputs of a network, before the batch's
             average, since near-degenerate sets have gradients a thousand times the typical one. None for no limit.
@@ -128,6 +129,8 @@ class EstimatorTask(pl.LightningModule):
         if not isinstance(estimator, self.trains):
             expected = " or ".join(kind.__name__ for kind in self.trains)
             raise TypeError(f"expected a {expected}, got {type(estimator).__name__}")
+        if sample_gradient is not None and not sample_gradient > 0:
+            raise ValueError(f"sample_gradient must be positive or None, got {sample_gradient}")
         if isinstance(estimator, EightPoint) and not isinstance(estimator.normalizer, LearnedNormalizer):
             raise TypeError(f"expected a LearnedNormalizer in EightPoint, got {type(estimator.normalizer).__name__}")
         self.estimator = cast(LearnedLayer | EightPoint, estimator.train())  # shipped weights come in evaluation mode
@@ -151,6 +154,8 @@ class EstimatorTask(pl.LightningModule):
     def configure_optimizers(self) -> Any:
         """Build the optimiser and its schedule."""
         optimizer = self.optimizer(p for p in self.parameters() if p.requires_grad)
+        # Lightning clips no gradients that a fused optimiser would unscale; so it has them unscaled before.
+        optimizer._step_supports_amp_scaling = False  # type: ignore[attr-defined]  # noqa: SLF001
         if self.lr_scheduler is not None:
             return {"optimizer": optimizer, "lr_scheduler": {"scheduler": self.lr_scheduler(optimizer)}}
         if self.trainer.estimated_stepping_batches == float("inf"):
@@ -158,12 +163,14 @@ class EstimatorTask(pl.LightningModule):
             raise ValueError(f"the learning rate follows one cycle over all steps: {expected}")
         steps = max(2, int(self.trainer.estimated_stepping_batches))
         share = max(self.warm_up, 1.5 / steps)  # the schedule divides by the warm-up's steps less one
-        schedule = OneCycle(optimizer, optimizer.param_groups[0]["lr"], total_steps=steps, pct_start=share)
+        group = optimizer.param_groups[0]
+        cycled = group.get("betas", (0.0,))[0] == 0.9  # PyTorch's default; another one, or a momentum, stays
+        schedule = OneCycle(optimizer, group["lr"], total_steps=steps, pct_start=share, cycle_momentum=cycled)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def training_step(self, batch: MatchSets, batch_idx: int) -> Tensor:
         """Log the loss of the batch of all processes and return the part of it that this one's sets make."""
-        batch, left_out = _finite(batch)
+        batch, left_out = self._finite(batch)
         number = len(batch.points1)
         # Without sets, all weights still take part: the other processes wait for their gradients.
         loss = self.compute_loss(batch) if number else 0 * torch.stack([p.sum() for p in self.parameters()]).sum()
@@ -187,6 +194,15 @@ class EstimatorTask(pl.LightningModule):
             raise ValueError(
                 f"{MAX_SKIPPED} steps in a row were skipped: no samples, or no finite gradient of the loss"
             )
+
+    def _finite(self, batch: MatchSets) -> tuple[MatchSets, int]:
+        """Return the sets that are finite, with the cameras that a pose needs, and how many others there are."""
+        if isinstance(self.loss, SetLoss) and batch.heldout1.shape[1] == 0:
+            raise ValueError("SetLoss needs held-out correspondences, got none: set num_heldout of the data")
+        cameras = cameras_of(batch) if isinstance(self.estimator, LearnedRelativePose) else ()
+        finite = torch.stack([part.isfinite().flatten(1).all(1) for part in (*batch[:4], *cameras)]).all(0)
+        left_out = len(finite) - int(finite.sum())
+        return (batch.select(finite) if left_out else batch), left_out
 
     def compute_loss(self, batch: MatchSets) -> Tensor:
         """Return the loss of a batch, of all stages, each set's gradient limited where it enters the networks."""
@@ -252,7 +268,7 @@ class EstimatorTask(pl.LightningModule):
 
     def validation_step(self, batch: MatchSets, batch_idx: int) -> None:
         """Log the metrics of a batch, in the test too; Lightning gathers them over batches and processes."""
-        batch, left_out = _finite(batch)
+        batch, left_out = self._finite(batch)
         points = batch.points1.double(), batch.points2.double()
         F_mat = self._estimate(batch)
         if isinstance(self.loss, SetLoss):
@@ -278,7 +294,8 @@ class EstimatorTask(pl.LightningModule):
     def predict_step(self, batch: MatchSets, batch_idx: int) -> dict[str, Tensor]:
         """Return matrices, mean residuals and, of a normaliser, transforms of a batch."""
         points, F_mat = (batch.points1.double(), batch.points2.double()), self._estimate(batch)
-        residual = symmetric_epipolar_distance(*points, F_mat).mean(-1)
+        distance = self.loss.labelled.residual if isinstance(self.loss, SetLoss) else symmetric_epipolar_distance
+        residual = distance(*points, F_mat).mean(-1)
         found = {"F_mat": F_mat, "residual": residual, "pair": batch.pair}
         if isinstance(self.trained, LearnedNormalizer):
             found["T1"], found["T2"] = self.trained(*points)
@@ -307,12 +324,6 @@ class Median(CatMetric):
     """The median of all values, the lower one of two."""
 
     def compute(self) -> Tensor:
-        """Return the median."""
-        return super().compute().median()
-
-
-def _finite(batch: MatchSets) -> tuple[MatchSets, int]:
-    """Return the sets whose coordinates are all finite, and how many others there are."""
-    finite = torch.stack([points.isfinite().flatten(1).all(1) for points in batch[:4]]).all(0)
-    left_out = len(finite) - int(finite.sum())
-    return (batch.select(finite) if left_out else batch), left_out
+        """Return the median; NaN without values."""
+        values = super().compute()  # an empty list without any
+        return values.median() if isinstance(values, Tensor) else torch.tensor(torch.nan)

@@ -12,13 +12,14 @@ from typing import Any
 import pytorch_lightning as pl
 import torch
 from jsonargparse import ArgumentError
+from lightning_fabric.plugins.io.torch_io import TorchCheckpointIO
 from lightning_fabric.utilities.exceptions import MisconfigurationException
 from pytorch_lightning.callbacks import ModelCheckpoint, ProgressBar, Timer, TQDMProgressBar
 from pytorch_lightning.cli import LightningCLI
 from pytorch_lightning.utilities.exceptions import SIGTERMException
 from torch import Tensor
 
-from kornia_learnnorm.files import exclusive, full_disk_names
+from kornia_learnnorm.files import atomic_write, exclusive, full_disk_names
 from kornia_learnnorm.optional import working_folder_importable
 from lightning_modules.callbacks import AgainstStart, Checkpoints, ExpectedTime, ExportWeights, WritePredictions
 from lightning_modules.config_files import config_names, names_task, with_config_paths
@@ -37,6 +38,16 @@ UNWANTED_WARNINGS = (
     ".*smaller than the logging interval.*",  # the interval counts the steps of all epochs
     "Checkpoint directory .* exists and is not empty.*",  # it is that of the run that goes on
 )
+
+
+class WholeCheckpoints(TorchCheckpointIO):
+    """Replaces checkpoints by whole ones alone; Lightning copies over the old one where /tmp is on another disk."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        """Write the checkpoint beside the old one, which it then replaces."""
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(path) as beside:
+            super().save_checkpoint(checkpoint, beside, storage_options)
 
 
 class TrainingCLI(LightningCLI):
@@ -73,6 +84,8 @@ class TrainingCLI(LightningCLI):
             if wanted and not any(isinstance(callback, kind) for callback in callbacks):
                 callbacks.append(default)
         trainer = super().instantiate_trainer(callbacks=callbacks, **kwargs)
+        if type(trainer.strategy.checkpoint_io) is TorchCheckpointIO:
+            trainer.strategy.checkpoint_io = WholeCheckpoints()
         if self.subcommand == "fit":
             names = "max_steps", "max_epochs", "limit_train_batches"
             zero = [name for name in names if getattr(trainer, name) == 0]

@@ -77,7 +77,7 @@ class Watch(pl.Callback):
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
         self.samples.append(len(batch.pair))
         for name, values in self.seen.items():
-            values.append(trainer.callback_metrics[name].item())
+            values.append(trainer.callback_metrics.get(name, torch.zeros(())).item())
 
 
 class Stop(pl.Callback):
@@ -101,6 +101,7 @@ class Interrupt(pl.Callback):
         if trainer.global_step == self.step:
             for _ in range(self.times):
                 os.kill(os.getpid(), self.number)
+            self.step = None  # not again in the next backward pass of an accumulation
 
 
 def normaliser_task(double=False, **arguments):

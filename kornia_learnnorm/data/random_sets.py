@@ -33,6 +33,8 @@ def augment(sets: MatchSets, generator: Generator) -> MatchSets:
     get a wrong partner: another match's, or their own shifted by 5-150 px in any direction. Directions in the cameras
     don't change: their matrices take the maps.
     """
+    if sets.image1 is not None:
+        raise ValueError("sets with images are not augmented: set augmented to 0")
     batch_size, centre = len(sets.points1), sets.points1.mean(1)
     A1, A2 = (A.to(centre) for A in _maps(batch_size, generator))
     points1, heldout1 = (transform_points(p - centre[:, None], A1) for p in (sets.points1, sets.heldout1))

@@ -109,6 +109,7 @@ class StoreReader:
             asked = f"pairs {self._first}:{stop} were asked for"
             raise ValueError(f"{self.path}: {asked}, the store has 0:{len(offsets) - 1}")
         self.offsets = offsets[self._first : stop + 1]
+        self._written = self.path.stat().st_mtime_ns
 
     def __len__(self) -> int:
         return len(self.offsets) - 1
@@ -126,6 +127,8 @@ class StoreReader:
             "M": [slice(int(self.offsets[a]), int(self.offsets[b])) for a, b in runs],
             "P": [slice(a + self._first, b + self._first) for a, b in runs],
         }
+        if self.path.stat().st_mtime_ns != self._written:
+            raise ValueError(f"{self.path} has changed since it was opened")
         with open_hdf5(self.path) as file:
             arrays: dict[str, Any] = {
                 name: np.concatenate([np.zeros((0, *tail), dtype), *(file[name][part] for part in rows[axis])])

@@ -146,6 +146,8 @@ def test_wrong_options():
         ({"batches": 0}, "at least 1, got 0"),
     ]:
         raises(ValueError, message, RandomSets, **{"sources": [SyntheticSets()]} | arguments)
+    sets = SyntheticSets().draw(2, 9, seeded())._replace(image1=torch.zeros(2, 1, 4, 4))
+    raises(ValueError, "sets with images are not augmented: set augmented to 0", augment, sets, seeded())
 
 
 class TestAugment:

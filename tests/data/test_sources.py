@@ -122,6 +122,8 @@ def test_blocks_without_samples(store, tmp_path):
     assert sorted(block.pairs for block in blocks) == [0, 1]
     for number, block in enumerate(blocks):
         assert source.draw(0, number).points1.shape == (block.samples, 9, 2)
+    weak = StoreSamples([str(tmp_path / "few.h5"), paths[1]], num_heldout=2, max_ratios=[None], max_residual=None)
+    assert weak.draw(0, 0).pair.unique().tolist() == [1]  # of eight, none is held out
     raises(ValueError, r"no pair of .*few\.h5 has 9 correspondences", StoreSamples, [str(tmp_path / "few.h5")], size=9)
 
 

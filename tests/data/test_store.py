@@ -95,12 +95,14 @@ def test_inconsistent_arrays_and_links_to_others(stored, name, value, message):
     raises(ValueError, message, read_store, stored)
 
 
-def test_a_failed_write_leaves_the_old_file(uneven, stored):
-    before = stored.read_bytes()
+def test_a_failed_write_leaves_the_old_file_and_no_other_is_read_on(uneven, stored):
+    before, reader = stored.read_bytes(), StoreReader(stored)
     broken = CorrespondenceStore(**{**vars(uneven), "K": "not an array"})
     raises(ValueError, "could not convert", write_store, stored, broken)
     assert stored.read_bytes() == before
     assert [file.name for file in stored.parent.iterdir()] == ["store.h5"]
+    write_store(stored, uneven)
+    raises(ValueError, r"store\.h5 has changed since it was opened", reader.read, [0])
 
 
 @pytest.mark.parametrize(("first", "stop"), [(0, 1), (2, 5), (0, 6)])

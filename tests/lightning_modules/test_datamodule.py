@@ -1,11 +1,13 @@
 """The loader and the datamodule: every sample once, the same batches wherever and however often they are drawn."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from train_processes import Pairs
 
 from kornia_learnnorm.data.random_sets import RandomSets, SyntheticSets
-from kornia_learnnorm.data.sources import SyntheticSamples
+from kornia_learnnorm.data.sources import Block, SyntheticSamples
 from lightning_modules.datamodule import BatchLoader, CorrespondenceDataModule
 
 
@@ -32,6 +34,16 @@ def test_batches_depend_on_seed_and_position_alone(source, size):
     else:
         assert [len(batch.pair) for batch in first] == [60] * 5
         assert torch.equal(torch.cat([batch.pair for batch in ordered]), torch.arange(300))
+
+
+@pytest.mark.parametrize(("size", "shuffle"), [(64, True), (64, False), (None, True), (9, False)])
+def test_small_blocks_are_batches_too(size, shuffle):
+    parts = SyntheticSamples(113, max_residual=None).draw(0, 0).pair.split([70, 3, 40])
+    source = SimpleNamespace(blocks=lambda seed: [Block(len(part), len(part)) for part in parts])
+    source.draw = lambda seed, block: SyntheticSamples(113, max_residual=None).draw(0, 0).select(parts[block])
+    batches = list(loader := BatchLoader(source, size, seed=0, shuffle=shuffle))
+    assert len(batches) == len(loader)
+    assert sorted(torch.cat([batch.pair for batch in batches]).tolist()) == list(range(113))
 
 
 def test_wrong_sizes_of_batches():

@@ -5,10 +5,13 @@ import signal
 
 import pytest
 import torch
+from lightning_fabric.plugins.io.torch_io import TorchCheckpointIO
+from scenes import raises
 from train_processes import SAMPLES, Blocks, Interrupt, Pairs, Stop, Watch, make_data, make_trainer, normaliser_task
 
 from kornia_learnnorm.data.random_sets import RandomSets, SyntheticSets
 from lightning_modules.callbacks import AgainstStart, Checkpoints
+from lightning_modules.training_command import WholeCheckpoints
 
 BLOCKS = Blocks(96, (96, 96, 96))  # so that workers have something to draw
 RANDOM = RandomSets([SyntheticSets(16)], sizes=(9, 64), correspondences=256, batches=9)
@@ -24,22 +27,31 @@ SIGNALS = signal.SIGINT, signal.SIGTERM
         (Stop(5), 2, 4, RANDOM, {"batch_size": None}),
         (Interrupt(4), 100, 5, BLOCKS, {"workers": 1}),  # no checkpoint is due; the step ends first
         (Interrupt(4, number=signal.SIGTERM), 100, 5, BLOCKS, {}),
+        (Interrupt(4), 100, 5, BLOCKS, {"accumulate_grad_batches": 3}),  # in the first of three batches
     ],
 )
 def test_a_run_that_was_cut_goes_on_to_the_same_curve(tmp_path, caplog, stop, every, saved, source, arguments):
     """An epoch has about nine batches: the run is cut in the middle of the first and of the second."""
     whole, second, watches = normaliser_task(), normaliser_task(), [Watch(), Watch()]
+    options = {"max_steps": 20, "accumulate_grad_batches": arguments.pop("accumulate_grad_batches", 1)}
     data = functools.partial(make_data, source, **arguments)
-    make_trainer(tmp_path / "whole", watches[:1], max_steps=20, enable_checkpointing=False).fit(whole, data())
+    make_trainer(tmp_path / "whole", watches[:1], enable_checkpointing=False, **options).fit(whole, data())
     handlers, last = [*map(signal.getsignal, SIGNALS)], tmp_path / "cut/checkpoints/last.ckpt"
     with pytest.raises((InterruptedError, SystemExit)), caplog.at_level("INFO"):
-        make_trainer(tmp_path / "cut", [Checkpoints(every), stop], max_steps=20).fit(normaliser_task(), data())
+        make_trainer(tmp_path / "cut", [Checkpoints(every), stop], **options).fit(normaliser_task(), data())
     assert f"; to go on, repeat the command with --ckpt_path {last}" in caplog.text
-    make_trainer(tmp_path / "cut", [watches[1], Checkpoints(every)], max_steps=20).fit(second, data(), ckpt_path=last)
+    make_trainer(tmp_path / "cut", [watches[1], Checkpoints(every)], **options).fit(second, data(), ckpt_path=last)
     assert [*map(signal.getsignal, SIGNALS)] == handlers
     torch.testing.assert_close(second.state_dict(), whole.state_dict(), rtol=0, atol=0)
     expected, got = (watch.seen["train/loss"] for watch in watches)
-    assert got == expected[saved:]
+    assert got == expected[saved * options["accumulate_grad_batches"] :]
+
+
+def test_a_checkpoint_that_fails_leaves_the_old_one(tmp_path, monkeypatch):
+    (tmp_path / "last.ckpt").write_bytes(b"whole")
+    monkeypatch.setattr(TorchCheckpointIO, "save_checkpoint", lambda self, saved, path, _: [path.touch(), saved["a"]])
+    raises(KeyError, "a", WholeCheckpoints().save_checkpoint, {}, tmp_path / "last.ckpt")
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("last.ckpt", b"whole")]
 
 
 def test_the_last_checkpoint_is_that_of_the_last_step(tmp_path):

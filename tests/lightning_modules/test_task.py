@@ -12,7 +12,7 @@ from kornia_learnnorm.data.sources import SyntheticSamples, block_generator
 from kornia_learnnorm.data.synthetic.random_matches import random_matches, random_planes
 from lightning_modules.callbacks import ExportWeights, WritePredictions
 from lightning_modules.datamodule import EVALUATION_SEED, CorrespondenceDataModule
-from lightning_modules.task import EstimatorTask, SetLoss
+from lightning_modules.task import EstimatorTask, Median, SetLoss
 
 SMALL = {"width": 16, "depth": 1, "stages": 2}
 FASTER = {"optimizer": lambda params: torch.optim.AdamW(params, lr=1e-2)}
@@ -40,13 +40,14 @@ def make_sets(labels=True, matches=random_matches, **arguments):
 @pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
 def test_samples_lower_the_loss(tmp_path, precision):
     """In bfloat16 the network, not the solver: the loss falls as in float32, and matrices are float64."""
-    task, data = normaliser_task(optimizer=lambda params: torch.optim.AdamW(params, lr=2e-2)), make_data()
+    task, data = normaliser_task(optimizer=lambda params: torch.optim.AdamW(params, lr=2e-2, fused=True)), make_data()
     batch = SyntheticSamples(number=1000).draw(99, 0)
     before, seen = task.compute_loss(batch).item(), []
     network = task.trained.network
     network.set_network.head.register_forward_hook(lambda m, a, out: seen.append(out.dtype))
     network.register_forward_hook(lambda m, a, out: seen.append(out[0].dtype))
-    make_trainer(tmp_path, max_steps=80, enable_checkpointing=False, precision=precision).fit(task, data)
+    options = {"enable_checkpointing": False, "gradient_clip_val": 1.0}  # with a fused optimiser, as configurations do
+    make_trainer(tmp_path, max_steps=80, precision=precision, **options).fit(task, data)
     assert set(seen[::2]) == {torch.bfloat16 if precision == "bf16-mixed" else torch.float32}
     assert set(seen[1::2]) == {torch.float64}
     assert all(p.dtype == torch.float32 and p.isfinite().all() for p in task.parameters())
@@ -70,6 +71,32 @@ def test_sets_lower_the_loss(kind, labels, steps, least, tmp_path):
     trainer.fit(task, data)
     assert task.compute_loss(batch).item() < before - least
     assert {"val/median_32", "val/median_256"} <= {*trainer.callback_metrics}
+
+
+def test_what_cannot_be_trained_on(tmp_path):
+    raises(ValueError, "sample_gradient must be positive or None, got -1", normaliser_task, sample_gradient=-1)
+    sets = SyntheticSets(8).draw(4, 20, block_generator(1))
+    without = sets._replace(heldout1=sets.heldout1[:, :0], heldout2=sets.heldout2[:, :0])
+    raises(ValueError, "SetLoss needs held-out correspondences, got none", set_task().validation_step, without, 0)
+    sets.K1[1] = torch.nan
+    assert [set_task(kind)._finite(sets)[1] for kind in ("layer", "pose")] == [0, 1]
+    (median := Median()).update(torch.zeros(0))  # all sets left out
+    assert median.compute().isnan()
+
+
+def test_betas_of_your_own_stay(tmp_path):
+    for betas, expected in [((0.9, 0.99), 0.95), ((0.5, 0.99), 0.5)]:
+        task = normaliser_task(optimizer=lambda params, betas=betas: torch.optim.AdamW(params, 1e-3, betas))
+        options = {"max_steps": 40, "limit_val_batches": 0, "enable_checkpointing": False}
+        (trainer := make_trainer(tmp_path, **options)).fit(task, make_data())
+        assert trainer.optimizers[0].param_groups[0]["betas"][0] == pytest.approx(expected, abs=1e-3)
+
+
+def test_predictions_of_homographies_have_their_own_distance():
+    sets = SyntheticSets(8, random_planes).draw(2, 20, block_generator(0))
+    found = set_task("homography").eval().predict_step(sets, 0)
+    distance = kln.transfer_distance(sets.points1.double(), sets.points2.double(), found["F_mat"])
+    torch.testing.assert_close(found["residual"], distance.mean(-1))
 
 
 def test_pose_loss_counts_sets_with_cameras_alone():

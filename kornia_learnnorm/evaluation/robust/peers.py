@@ -25,7 +25,10 @@ CALIBRATED = "-calibrated"  # suffix of the names of estimators that know the ca
 
 def _opencv(method: str, cv2: Any, x1: Array, x2: Array, sizes: Sizes, seed: int, threshold: float) -> Any:
     # These methods draw their samples from a generator with a fixed seed: runs differ by the order of the matches.
-    return cv2.findFundamentalMat(x1, x2, getattr(cv2, method), threshold)[0]
+    try:
+        return cv2.findFundamentalMat(x1, x2, getattr(cv2, method), threshold)[0]
+    except cv2.error:  # an assertion in USAC, where it has fewer inliers than it samples
+        return None
 
 
 def _poselib(poselib: Any, x1: Array, x2: Array, sizes: Sizes, seed: int, threshold: float) -> Any:
@@ -33,7 +36,10 @@ def _poselib(poselib: Any, x1: Array, x2: Array, sizes: Sizes, seed: int, thresh
 
 
 def _opencv_calibrated(cv2: Any, x1: Array, x2: Array, sizes: Sizes, seed: int, threshold: float, K: Array) -> Any:
-    E = cv2.findEssentialMat(x1, x2, K[0], None, K[1], None, method=cv2.USAC_MAGSAC, threshold=threshold)[0]
+    try:
+        E = cv2.findEssentialMat(x1, x2, K[0], None, K[1], None, method=cv2.USAC_MAGSAC, threshold=threshold)[0]
+    except cv2.error:
+        return None
     return None if E is None or E.shape != (3, 3) else _to_pixels(E, K)
 
 

@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -206,6 +207,9 @@ def test_what_fails_is_a_failure(monkeypatch):
     for wrong in (None, np.zeros((9, 3))):
         monkeypatch.setitem(peers.PEERS, "poselib", ("math", lambda *_, wrong=wrong: wrong))
         assert run_estimator(find_estimator("poselib"), matches(), 0, 1.0).F_mat.isnan().all()
+    cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
+    monkeypatch.setattr(cv2, "findFundamentalMat", Mock(side_effect=cv2.error("an assertion in USAC")))
+    assert run_estimator(find_estimator("opencv-usac-magsac"), matches(), 0, 1.0).F_mat.isnan().all()
     few = matches()._replace(points1=torch.rand(7, 2).double(), points2=torch.rand(7, 2).double())
     assert run_estimator(find_estimator("RANSAC"), few, 0, 1.0).F_mat.isnan().all()
 
