@@ -117,7 +117,6 @@ def make_data(source=SAMPLES, **arguments):
 
 
 def make_trainer(folder, callbacks=(), **arguments):
-    """A trainer that prints nothing."""
     quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "accelerator": "cpu"}
     options = {"default_root_dir": folder, "max_epochs": -1, **quiet, **arguments}
     return pl.Trainer(callbacks=list(callbacks), **options)

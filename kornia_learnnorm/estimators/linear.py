@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.estimators.matches import MatchLayer
-from kornia_learnnorm.geometry.checks import check_cameras, check_correspondences, inference_mode
+from kornia_learnnorm.geometry.checks import check_cameras, check_correspondences, inference_mode, without_autocast
 from kornia_learnnorm.geometry.dlt import DEPENDENT_GAP
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem, prepare_problem, solve_where_determined
@@ -279,4 +279,5 @@ def essential_matrix(F_mat: Tensor, K1: Tensor | None, K2: Tensor | None) -> Ten
     r"""Return :math:`K_2^\top F K_1` with unit Frobenius norm, None without cameras."""
     if K1 is None or K2 is None:
         return None
-    return unit_matrix(transform_fundamental(F_mat, K1.to(F_mat), K2.to(F_mat)))
+    with without_autocast(F_mat):
+        return unit_matrix(transform_fundamental(F_mat, K1.to(F_mat), K2.to(F_mat)))
