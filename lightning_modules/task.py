@@ -94,9 +94,8 @@ class EstimatorTask(pl.LightningModule):
     With :class:`SetLoss`, validation and test log the median distance of the held-out matches by the size of the sets;
     with another loss, the mean log residual of the samples' own points and the better rates against Hartley and
     whitening. Sets with a NaN or infinite coordinate, or for a relative pose without cameras, are left out and counted:
-    ``train/left_out``. A step without any
-    other set, or with a gradient that is not finite, changes nothing, warns, and is counted: ``train/skipped``; twenty
-    in a row are a ValueError.
+    ``train/left_out``. A step without any other set, or with a gradient that is not finite, changes nothing, warns, and
+    is counted: ``train/skipped``; twenty in a row are a ValueError.
 
     Args:
         estimator: the estimator to train: a :class:`~kornia_learnnorm.LearnedEightPoint`, a
