@@ -31,15 +31,13 @@ TORCH ?= $$(grep '^torch==' requirements.lock)
 
 .PHONY: bench weights demo test test-cpus test-oldest test-newest lint docs audit wheel check-wheel check-extras clean ablations layer-ablations size-ablations pose-ablations refiner-ablations table1
 
-# The lock pins everything. torch goes first and alone, so that no other package's range can choose another build. pip
-# would compile one file after another.
+# The lock pins everything. torch goes first and alone, so that no other package's range can choose another build.
 $(VENV)/.ready: requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, got " + sys.version)'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --no-compile $$(grep '^torch==' requirements.lock)
-	$(BIN)/python -m pip install --quiet --no-compile --requirement requirements.lock
+	$(BIN)/python -m pip install --quiet $$(grep '^torch==' requirements.lock)
+	$(BIN)/python -m pip install --quiet --requirement requirements.lock
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
-	-$(BIN)/python -m compileall -qq -j 0 $(VENV) 2> /dev/null
 	touch $@
 
 # The matrices are small: more threads wait for each other.
