@@ -32,6 +32,8 @@ MAX_BATCH = 1024  # samples in a batch
 MAX_SCORED = 4096  # correspondences that hypotheses are scored on, drawn once
 POOL_SIZE = 12  # best hypotheses of a batch, which local optimisation fits, and of all, which the final fit does
 CONFIDENCE, CALIBRATED_CONFIDENCE = 0.999999, 0.999  # unless another one is asked for
+FEW_INLIERS = 0.4  # of the matches; below, the last tenth of the samples, or a batch, is drawn near the best matrix
+NEAR = 20.0  # thresholds; of the matches this near the best matrix, fewer are outliers than of all
 Cameras = tuple[Tensor, Tensor]
 
 
@@ -53,8 +55,9 @@ class RANSAC(nn.Module):
     Minimal samples of seven are solved a thousand at once, or with a normaliser samples of eight by
     :func:`~kornia_learnnorm.find_fundamental`, and MSAC scores their matrices. The best of each batch are fitted to
     their inliers by reweighted least squares, and the first also by the normaliser (local optimisation); the inliers of
-    the best matrix so far say how many samples are still needed. In the end the best few are fitted on Geman and
-    McClure's loss, and the one of least cost goes on to Levenberg-Marquardt where least squares have not converged.
+    the best matrix so far say how many samples are still needed. Where they are few, or the samples run out, the last
+    samples are drawn near the best matrix. In the end the best few are fitted on Geman and McClure's loss, and the one
+    of least cost goes on to Levenberg-Marquardt where least squares have not converged.
 
     With both cameras, minimal samples of five run through Nister's five-point solver, and local optimisation and the
     final fit are least squares on essential matrices; distances stay in pixels. Where a fundamental matrix then
@@ -264,21 +267,29 @@ class RANSAC(nn.Module):
     def _search(self, scorer: PairScorer, sampler: Sampler, generator: torch.Generator) -> tuple[Hypotheses, int]:
         """Return the best hypotheses that enough minimal samples give, best first, and the number of samples."""
         pool = Hypotheses(scorer.x1.new_zeros(0, 3, 3), scorer.x1.new_zeros(0))
-        batch, drawn, needed, start = FIRST_BATCH, 0, self.max_samples, time.perf_counter()
+        most = self.max_samples - (self.max_samples // 10 if self.refine else 0)
+        batch, drawn, needed, start, near_best = FIRST_BATCH, 0, most, time.perf_counter(), False
         while drawn < needed:
             if self.max_seconds is not None and drawn and time.perf_counter() - start > self.max_seconds:
                 break
-            rows = sampler.draw(min(batch, needed - drawn), generator)
+            source = sampler
+            if near_best and len(pool.F_mat):
+                source = sampler.among(scorer.distances(pool.F_mat[:1])[0] < NEAR * self.inl_th)
+            rows = source.draw(min(batch, needed - drawn), generator)
             drawn, batch = drawn + len(rows), min(4 * batch, MAX_BATCH)
             F_mat = solve_minimal_samples(scorer, rows, self.model, self.normalizer)
             found = scorer.best(scorer.shortlist(F_mat) if self.refine else F_mat, POOL_SIZE)
             pool = pool.join(found, POOL_SIZE)
-            needed = self._samples_needed(pool, scorer, sampler)
+            needed = needed if near_best else min(most, self._samples_needed(pool, scorer, sampler))
             # The final fit optimises a pool that ends the search, but of essential matrices its best one alone.
             fitted_later = drawn >= needed and not isinstance(scorer.model, Essential)
             if self.refine and not fitted_later and len(found.F_mat):
                 pool = pool.join(self._optimize(scorer, found.F_mat), POOL_SIZE)
-                needed = self._samples_needed(pool, scorer, sampler)
+                needed = needed if near_best else min(most, self._samples_needed(pool, scorer, sampler))
+            if self.refine and not near_best and drawn >= needed:
+                few = len(pool.F_mat) > 0 and scorer.inliers(pool.F_mat[:1]).to(scorer.x1).mean() < FEW_INLIERS
+                if few or drawn >= most:
+                    near_best, needed = True, min(drawn + max(MAX_BATCH, drawn // 9), self.max_samples)
         return pool, drawn
 
     def _optimize(self, scorer: PairScorer, M: Tensor) -> Hypotheses:

@@ -48,6 +48,10 @@ class UniformSampler:
         """Return the probability of a sample without outliers, from the inliers (M,) among some rows."""
         return float(inliers.float().mean()) ** self.size
 
+    def among(self, rows: Tensor) -> "Sampler":
+        """Return a sampler of some rows (N,) bool; itself where they are too few for distinct samples."""
+        return self if int(rows.sum()) < 2 * self.size else WeightedSampler(rows.float(), self.size)
+
 
 class WeightedSampler:
     """Samples with probability in proportion to the squares of weights, without replacement.
@@ -88,6 +92,11 @@ class WeightedSampler:
         """Return the probability of a sample without outliers, from the inliers (M,) among some rows."""
         weights = self.weights[rows].cpu()
         return float(((weights * inliers.cpu()).sum() / weights.sum()) ** self.size)
+
+    def among(self, rows: Tensor) -> "Sampler":
+        """Return a sampler of some rows (N,) bool; itself where too few of them have a weight for distinct samples."""
+        weights = torch.where(rows, self.weights.sqrt(), 0.0)
+        return self if int((weights > 0).sum()) < 2 * self.size else WeightedSampler(weights, self.size)
 
 
 Sampler = UniformSampler | WeightedSampler
