@@ -9,6 +9,7 @@ from torch import Tensor
 from kornia_learnnorm.data.images import Size
 from kornia_learnnorm.data.matching.matchers import one_to_one
 from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
+from kornia_learnnorm.geometry.checks import without_autocast
 from kornia_learnnorm.geometry.pose import in_front, relative_pose
 from kornia_learnnorm.geometry.transforms import transform_fundamental
 from kornia_learnnorm.metrics.statistics import median
@@ -93,18 +94,19 @@ def estimate_matches(
     unknown = size1 is None, size2 is None
     size1, size2 = read_size("size1", size1, points1), read_size("size2", size2, points2)
     given = None if unknown[0] else size1, None if unknown[1] else size2
-    solver = TwoViewSolver(points1, points2, scores, threshold, seed, layer, cameras)
-    choice, found, H_mat = choose_model(solver, model, size1, size2)
-    F_mat = None if found is None else found.matrix
-    if choice.model == "homography":
-        fields, error, doubts = _answer_homography(solver, cast(Tensor, H_mat), F_mat)
-    else:
-        fields, error, doubts = _answer_fundamental(solver, cast(Solution, found), size1, size2)
-    relief = choice.model == "fundamental" and choice.parallax is not None and not choice.parallax.planar
-    if cameras is not None:  # a plane contradicts no cameras, but wrong cameras can make a scene look like a plane
-        doubt = find_camera_doubt(cameras, given, points1, points2, F_mat if relief else None, threshold)
-        doubts += doubt or _compare_free(solver, fields)
-    elif choice.model == "fundamental" and choice.parallax is not None and not relief:
+    with without_autocast(points1):
+        solver = TwoViewSolver(points1, points2, scores, threshold, seed, layer, cameras)
+        choice, found, H_mat = choose_model(solver, model, size1, size2)
+        F_mat = None if found is None else found.matrix
+        if choice.model == "homography":
+            fields, error, doubts = _answer_homography(solver, cast(Tensor, H_mat), F_mat)
+        else:
+            fields, error, doubts = _answer_fundamental(solver, cast(Solution, found), size1, size2)
+        relief = choice.model == "fundamental" and choice.parallax is not None and not choice.parallax.planar
+        if cameras is not None:  # a plane contradicts no cameras, but wrong cameras can make a scene look like a plane
+            doubt = find_camera_doubt(cameras, given, points1, points2, F_mat if relief else None, threshold)
+            doubts += doubt or _compare_free(solver, fields)
+    if cameras is None and choice.model == "fundamental" and choice.parallax is not None and not relief:
         doubts += (PairWarning("planar", choice.parallax.describe(threshold)),)
     if model == "homography" and choice.parallax is not None and choice.parallax.log_chance <= MAX_LOG_CHANCE_PARALLAX:
         doubts += (PairWarning("relief", f"{choice.parallax.describe(threshold)}: H holds for one plane of the scene"),)
