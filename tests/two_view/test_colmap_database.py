@@ -172,13 +172,11 @@ class TestErrors:
         raises(FileExistsError, r"written\.db exists already: remove it", export, images)
         assert (images / "written.db").read_text() == "mine"
 
-    def test_skew_and_unreadable(self, images):
-        with pytest.raises(ValueError, match=r"K must have no skew, .* got 5\.0"):
-            export(images, K=K + np.array([[0, 5, 0], [0, 0, 0], [0, 0, 0]]))
+    def test_skew_and_unreadable_and_missing_images(self, images):
+        skew = np.array([[0, 5, 0], [0, 0, 0], [0, 0, 0]])
+        raises(ValueError, r"K must have no skew, .* got 5\.0", export, images, K=K + skew)
         (images / NAMES[1]).write_bytes(b"")
         raises(ValueError, r"views/1\.png is not an image that can be read", export, images)
-
-    def test_missing_image(self, images):
         (images / NAMES[2]).unlink()
         raises(FileNotFoundError, r"1 of 4 images are not in .*, the first is views/2\.png", export, images)
 

@@ -55,13 +55,11 @@ class TestReadColmap:
             set_camera(colmap, camera)
             raises(ValueError, message, read, colmap)
 
-    def test_missing_and_unreadable_images(self, colmap):
+    def test_missing_and_unreadable_files(self, colmap):
         (colmap / "images/one/1.png").write_bytes(b"")
         assert [frame.size for frame in read(colmap)] == [SIZE, (0, 0), SIZE, SIZE]
         shutil.rmtree(colmap / "images/two")
         raises(FileNotFoundError, r"2 of 4 images are not in .*images, the first is two/2\.png", read, colmap)
-
-    def test_missing_file(self, colmap):
         (colmap / "model" / "points3D.txt").unlink()
         raises(FileNotFoundError, r"no COLMAP model at .*model: it lacks points3D\.bin or", read, colmap)
 

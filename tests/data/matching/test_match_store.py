@@ -160,13 +160,6 @@ class TestProcesses:
         with pytest.raises(OSError, match=r"were killed 4 times in a row: killed"):
             collect_matches(pairs_of(images), tmp_path / "store.h5", OPTIONS)
 
-    @pytest.mark.parametrize("address", ["127.0.0.1:bad", "http://127.0.0.1:1"])
-    def test_no_processes(self, images, tmp_path, address):
-        pytest.importorskip("distributed", reason="Dask is not installed")
-        with pytest.raises(ValueError, match=f"address as tcp://host:8786, got '{address}'"):
-            collect_matches(pairs_of(images), tmp_path / "store.h5", OPTIONS, dask=address)
-        assert list(tmp_path.iterdir()) == []
-
 
 class TestDask:
     @pytest.mark.usefixtures("_a_worker_dies")
@@ -177,12 +170,16 @@ class TestDask:
             collect_matches(pairs_of(images), tmp_path / "store.h5", OPTIONS, dask=cluster.scheduler_address)
         assert_same(expected, tmp_path / "store.h5")
 
-    def test_nobody_at_the_address(self, images, tmp_path):
+    @pytest.mark.parametrize("address", ["127.0.0.1:bad", "http://127.0.0.1:1", "tcp://127.0.0.1:1"])
+    def test_nobody_at_the_address(self, images, tmp_path, address):
         pytest.importorskip("distributed", reason="Dask is not installed")  # before its settings are changed
         import dask
 
-        with dask.config.set({"distributed.comm.timeouts.connect": "0.2s"}), pytest.raises(OSError, match="tcp"):
-            collect_matches(pairs_of(images), tmp_path / "store.h5", OPTIONS, dask="tcp://127.0.0.1:1")
+        match = "tcp" if address.startswith("tcp") else f"address as tcp://host:8786, got '{address}'"
+        with dask.config.set({"distributed.comm.timeouts.connect": "0.2s"}):
+            raises(
+                (OSError, ValueError), match, collect_matches, pairs_of(images), tmp_path / "s", OPTIONS, dask=address
+            )
         assert list(tmp_path.iterdir()) == []
 
 
