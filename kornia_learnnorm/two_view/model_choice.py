@@ -2,6 +2,7 @@
 
 import math
 
+import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
@@ -16,6 +17,7 @@ from kornia_learnnorm.two_view.solver import MIN_MATCHES, Solution, TwoViewSolve
 
 MIN_PLANE_SUPPORT = 0.9  # of the inliers of an essential matrix, which outliers agree with more easily
 ASKED = "asked for"
+MEDIAN_SQUARE_OF_TWO = 2 * math.log(2)  # median of the sum of two squared standard normal variables
 
 
 def choose_model(
@@ -80,7 +82,8 @@ def compute_gric(
     """Return the geometric robust information criterion of a fundamental matrix (3, 3) and of a homography.
 
     The smaller one is the better model. Of matches (N, 2), the inliers of either matrix count, with squared Sampson
-    distances of one and of two degrees of freedom; the noise is that of the inliers of the fundamental matrix.
+    distances of one and of two degrees of freedom; the noise is the larger one of those that the inliers of either
+    show, since on a plane a fundamental matrix is free to fit their noise.
 
     Reference:
         P. Torr, A. Fitzgibbon, A. Zisserman, The problem of degeneracy in structure and motion recovery from
@@ -91,9 +94,10 @@ def compute_gric(
         model.squares(model.residual(M[None], x1, x2))[0]
         for model, M in ((Fundamental(), F_mat), (Homography(), H_mat))
     )
-    inliers = squares1 < threshold**2
-    kept = inliers | (squares2 < threshold**2)
-    variance = (squares1[inliers].median() / MEDIAN_SQUARE).clamp(min=MIN_NOISE**2 * threshold**2)
+    inliers, moved = squares1 < threshold**2, squares2 < threshold**2
+    kept = inliers | moved
+    variances = squares1[inliers].median() / MEDIAN_SQUARE, squares2[moved].median() / MEDIAN_SQUARE_OF_TWO
+    variance = torch.stack(variances).nan_to_num(0.0).amax().clamp(min=MIN_NOISE**2 * threshold**2)
     parameters = Essential.dof if calibrated else Fundamental.dof
     return _gric(squares1[kept] / variance, 3, parameters), _gric(squares2[kept] / variance, 2, Homography.dof)
 

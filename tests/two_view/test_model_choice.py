@@ -89,7 +89,7 @@ def test_gric():
     rows = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]]).double()  # epipolar lines are the rows
     found = compute_gric(x1, x2, rows, torch.eye(3).double(), 1.0, False)
     squares1 = np.array([0.25, 0.25, 0.25, 0.005, 0, 0])
-    variance = 0.005 / 0.455
+    variance = 0.25 / (2 * np.log(2))  # by the four that are not moved too far; by the lines it is smaller
     for cost, squares, most, dimension, dof in zip(
         found, (squares1, [0.25, 0.25, 0.25, 0.005, 4.5, 4.5]), (2, 4), (3, 2), (7, 8), strict=True
     ):
