@@ -1,10 +1,11 @@
-"""The wheel: the same bytes from the same files, configurations and weights in it, the version of the package."""
+"""The package: names of its files, what importing it loads; its wheel, with configurations and weights."""
 
 import os
 import subprocess
 import sys
 import tomllib
 import zipfile
+from collections import Counter
 from importlib import import_module
 from pathlib import Path
 
@@ -13,6 +14,8 @@ import pytest
 import kornia_learnnorm as kln
 
 ROOT = Path(__file__).parents[1]
+HEAVY = ["pytorch_lightning", "lightning", "cv2", "h5py", "matplotlib", "jsonargparse", "torchmetrics", "tabulate"]
+HEAVY += ["gradio", "huggingface_hub"]
 BUILD = "from hatchling.build import build_wheel; import sys; build_wheel(sys.argv[1])"
 
 
@@ -60,3 +63,15 @@ def test_every_extra_is_checked():
     checks = import_module("check_extras").CHECKS
     assert set(checks) == set(project["optional-dependencies"]) - {"dev", "docs", "all"} | {"core"}
     assert [extra for extra in checks if extra != "core" and f"\n| `{extra}` |" not in documented] == []
+
+
+def test_no_file_name_occurs_twice():
+    """A responsibility has one place to look for."""
+    names = Counter(path.stem for path in (ROOT / "kornia_learnnorm").rglob("*.py") if path.stem != "__init__")
+    assert [name for name, number in names.items() if number > 1] == []
+
+
+def test_importing_the_package_loads_nothing_heavy():
+    code = f"import sys, kornia_learnnorm; print(*[name for name in {HEAVY} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []

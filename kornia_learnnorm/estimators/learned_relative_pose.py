@@ -59,8 +59,9 @@ class LearnedRelativePose(LearnedLayer):
     (:func:`~kornia_learnnorm.geometry.five_point.essential_in_span`), the nearest one to the smallest eigenvector, that
     of the stage before and, in the last stage, those of minimal samples drawn by the weights. The one of least robust
     cost is refined by reweighted least squares of the Sampson distances over the five parameters of a relative pose,
-    which carries the gradients. In evaluation, sets of 16 correspondences and more with a mean probability above 0.7 in
-    the first stage leave out its matrix, the other networks and half of the samples.
+    which carries the gradients. Where fewer than four tenths of the correspondences agree with it, as many samples are
+    drawn again near it. In evaluation, sets of 16 correspondences and more with a mean probability above 0.7 in the
+    first stage leave out its matrix, the other networks and half of the samples.
 
     Cameras may be inexact, or lenses distort: where the correspondences contradict them by a score test, and a pose
     without them has at most three times the standard error and fits to a few pixels, the pose is that of the refined

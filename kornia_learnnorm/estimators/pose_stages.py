@@ -45,6 +45,9 @@ PIXEL_FLOOR = 1e-3  # pixels, added to distances before their logarithm
 MIN_WEIGHT = 1e-6  # added to weights of which the largest is one
 MAX_SCORED = 256  # matches by which the matrices of minimal samples are compared first
 SHORTLIST = 6  # matrices of minimal samples that are compared on all matches
+# Where fewer of the matches are inliers, samples are drawn again from those so many pixels near the best matrix, if
+# there are as many.
+FEW_INLIERS, NEAR_PIXELS, MIN_NEAR = 0.4, 14.0, 16
 
 Candidates = tuple[Tensor, Tensor]  # essential matrices (B, S, 3, 3), and which of them are real
 
@@ -104,6 +107,7 @@ def run_pose_stages(
     drawn = 0 if detach_stages else layer.samples
     with torch.no_grad():
         state, front = _most_consistent(evidence, model, unit, weights, suggested, before, drawn, settled)
+        state, front = _search_near(evidence, model, unit, weights, state, front, drawn, settled)
     state = model.attach(state)
     share = torch.where(front & (weights > 0), weights.clamp(min=tiny) ** LAST_POWER, 0.0)
     scale = torch.where(settled[:, None], SETTLED_SCALE, last * scale)
@@ -182,6 +186,30 @@ def _most_consistent(
     cost = (torch.where(front, losses, 1.0) @ present[..., None])[..., 0]
     best = cost.argmin(1)
     return pick(state, best, number), front.gather(1, best[:, None, None].expand(-1, 1, front.shape[-1]))[:, 0]
+
+
+def _search_near(
+    evidence: Evidence,
+    model: Essential,
+    unit: Tensor,
+    weights: Tensor,
+    state: Calibrated,
+    front: Tensor,
+    samples: int,
+    settled: Tensor,
+) -> tuple[Calibrated, Tensor]:
+    """Return the states, where few matches agree with them those of a search among the matches near them."""
+    if not samples or is_known_true(settled.all()):
+        return state, front
+    pixels = evidence.squares(state.matrix()[:, None])[0][:, 0].sqrt() * unit
+    near = torch.where(pixels < NEAR_PIXELS, weights, 0.0)
+    again = ((pixels < LAST_PIXELS) & front).sum(1) < FEW_INLIERS * (weights > 0).sum(1)
+    again = again & ((near > 0).sum(1) >= MIN_NEAR)
+    if is_known_true(~again.any()):
+        return state, front
+    best = state.essential()[:, None], torch.ones_like(again)[:, None]
+    found, found_front = _most_consistent(evidence, model, unit, near, near, best, samples, settled)
+    return choose(again, found, state), torch.where(again[:, None], found_front, front)
 
 
 def _moment_spans(evidence: Evidence, model: Essential, weights: Tensor) -> Tensor:

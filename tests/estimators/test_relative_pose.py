@@ -10,7 +10,7 @@ from scenes import distorted, roughened, scenes, seeded, uniform
 from torch.nn.functional import normalize
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.estimators import camera_evidence, moments
+from kornia_learnnorm.estimators import camera_evidence, moments, pose_stages
 from kornia_learnnorm.estimators.moments import Evidence
 from kornia_learnnorm.estimators.network_features import CommonFrame
 from kornia_learnnorm.estimators.optimize import RobustCost, minimize
@@ -70,6 +70,17 @@ def test_planes_and_outliers():
         found = roughened(kln.LearnedRelativePose, samples=64).estimate(points1, points2, K, K)
     assert (kln.sampson_distance(points1[:, 20:], points2[:, 20:], found.F_mat).amax(1) < 1e-3).double().mean() >= 0.8
     assert ((found.R - R).flatten(1).norm(dim=1) < 1e-3).any()  # a plane has two poses
+
+
+def test_few_inliers_are_searched_again(monkeypatch):
+    layer, right = kln.LearnedRelativePose.from_pretrained(), []
+    scene = scenes("handheld", 24, 300, noise=0.5, outliers=0.9)
+    for share in (0.4, 0.0):
+        monkeypatch.setattr(pose_stages, "FEW_INLIERS", share)
+        with torch.no_grad():
+            found = layer.estimate(scene.points1, scene.points2, scene.K1, scene.K2)
+        right.append((pose_error(found.R, found.t, scene.R, scene.t) < 5).double().mean())
+    assert right[0] > right[1] + 0.2
 
 
 def test_cameras_are_left_where_matches_contradict_them():

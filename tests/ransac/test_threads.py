@@ -27,7 +27,7 @@ def test_one_inside_and_all_after_an_error_too():
     assert torch.get_num_threads() == 3
 
 
-def test_callers_that_overlap():
+def test_callers_that_overlap_and_ransac():
     barrier = Barrier(2)
 
     def caller(before, inside):
@@ -41,8 +41,5 @@ def test_callers_that_overlap():
     with ThreadPoolExecutor() as pool:
         assert [*pool.map(caller, (0, 1), (2, 1))] == [3, 3]  # the first enters before the second, and leaves with it
     assert torch.get_num_threads() == 3
-
-
-def test_ransac_gives_the_threads_back():
     RANSAC(seed=0, max_samples=64)(torch.rand(20, 2), torch.rand(20, 2))
     assert torch.get_num_threads() == 3
