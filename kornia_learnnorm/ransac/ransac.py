@@ -32,7 +32,7 @@ MAX_BATCH = 1024  # samples in a batch
 MAX_SCORED = 4096  # correspondences that hypotheses are scored on, drawn once
 POOL_SIZE = 12  # best hypotheses of a batch, which local optimisation fits, and of all, which the final fit does
 CONFIDENCE, CALIBRATED_CONFIDENCE = 0.999999, 0.999  # unless another one is asked for
-FEW_INLIERS = 0.4  # of the matches; below, the last tenth of the samples, or a batch, is drawn near the best matrix
+FEW_INLIERS = 0.25  # of the matches; below, the last tenth of the samples, or a batch, is drawn near the best matrix
 NEAR = 20.0  # thresholds; of the matches this near the best matrix, fewer are outliers than of all
 Cameras = tuple[Tensor, Tensor]
 
