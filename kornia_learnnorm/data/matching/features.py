@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from kornia_learnnorm.data.images import check_grey, import_cv2
 
+SIFT_OFFSET = 0.25  # pixels; OpenCV's keypoints are this far to the right and down of what they are found on
 MASK_MARGIN = 8  # pixels along each axis; a feature nearer to a masked pixel is of the mask's edge
 
 
@@ -43,6 +44,7 @@ def detect_sift(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
     _check(image, num_features)
     keypoints, descriptors = import_cv2().SIFT_create(num_features).detectAndCompute(image, None)
     found = torch.tensor([(*keypoint.pt, keypoint.size / 2, -keypoint.angle) for keypoint in keypoints]).view(1, -1, 4)
+    found[..., :2] -= SIFT_OFFSET
     lafs = laf_from_center_scale_ori(found[..., :2], found[..., 2, None, None], found[..., 3:])[0].numpy()
     # OpenCV's descriptors are whole numbers up to 255 in float32.
     rows = np.zeros((0, 128), np.uint8) if descriptors is None else descriptors.astype(np.uint8)

@@ -26,6 +26,13 @@ def _no_networks_kept():
     features.pretrained.cache_clear()
 
 
+def test_sift_finds_the_centre_of_a_blob():
+    rows, columns = np.mgrid[:120, :160]
+    image = 200 * np.exp(-((columns - 70.3) ** 2 + (rows - 50.6) ** 2) / 18)
+    found = features.detect_sift(np.round(image).astype(np.uint8), 10).points
+    assert np.abs(found - [70.3, 50.6]).max() < 0.1
+
+
 def test_rootsift_is_the_root_of_sift_of_unit_sum_and_a_blank_image_has_none():
     sift, root = features.detect_sift(texture(), 100), features.detect_rootsift(texture(), 100)
     rows = sift.descriptors.astype(np.float64)
@@ -82,14 +89,11 @@ def test_lightglue_gets_the_frames_that_kornia_gives_it(monkeypatch, name, scale
     given = {}
 
     class Spy(torch.nn.Module):
-        def __init__(self, *_, **__):
-            super().__init__()
-
         def forward(self, data):
             given.update(data)
             return {"matches0": torch.full((1, 2), -1), "matching_scores0": torch.zeros(1, 2)}
 
-    monkeypatch.setattr("kornia.feature.integrated.LightGlue", Spy)
+    monkeypatch.setattr("kornia.feature.integrated.LightGlue", lambda *_, **__: Spy())
     found = [features.detect_rootsift(texture(seed, 200), 50) for seed in range(2)]
     rows, lafs = ([torch.from_numpy(getattr(side, part)) for side in found] for part in ("descriptors", "lafs"))
     frames = [scale_laf(side[None], scale) for side in lafs]
