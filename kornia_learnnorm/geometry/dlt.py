@@ -67,11 +67,12 @@ def _null_vector_of_eight(A: Tensor, weights: Tensor | None) -> tuple[Tensor, Te
     """Return null vectors (*, 9) of eight rows and relative gaps (*)."""
     if weights is not None:
         A = A * (weights > 0).to(A)[..., None]
+    derivatives = needs_gradient(A)
     with torch.no_grad():
-        h0, pivots = _eliminate(A)
+        h0, pivots = _eliminate(A.detach() if derivatives else A)  # `no_grad` leaves forward-mode derivatives
         largest = pivots.amax(-1)
         gap = pivots.amin(-1) / (largest + (largest == 0))
-    if not needs_gradient(A):
+    if not derivatives:
         return h0, gap
     # The linear system [A; h0^T] h = e9, with h0 held fixed, has the solution h0 and gives its derivatives. The
     # substitute enters before the solve and its result is dropped after it: no derivative meets a singular matrix.
@@ -151,20 +152,25 @@ def _smallest(A: Tensor, weights: Tensor | None, product: Callable[[Tensor], Ten
     has the derivatives, brings the digits back, and two more give the derivatives. A last singular value that is not
     simple sends a zero gradient instead of an infinite one.
     """
-    with torch.no_grad():
-        values, vectors = torch.linalg.eigh(A.mT @ (A if weights is None else A * weights[..., None]))
+    derivatives = needs_gradient(A, weights)
+    with torch.no_grad():  # which leaves forward-mode derivatives
+        fixed, shares = A.detach() if derivatives else A, weights
+        if derivatives and shares is not None:
+            shares = shares.detach()
+        values, vectors = torch.linalg.eigh(fixed.mT @ (fixed if shares is None else fixed * shares[..., None]))
         s, Vh = values.clamp(min=0).sqrt().flip(-1), vectors.mT.flip(-2)
         precise = s[..., -2] > MIN_GRAM_RATIO * s[..., 0]
         if not read_condition(precise.all()):
-            rooted = A if weights is None else A * weights.sqrt()[..., None]
+            rooted = fixed if shares is None else fixed * shares.sqrt()[..., None]
             _, s_exact, Vh_exact = torch.linalg.svd(rooted, full_matrices=False)
             s, Vh = torch.where(precise[..., None], s, s_exact), torch.where(precise[..., None, None], Vh, Vh_exact)
         others, v = Vh[..., :-1, :], Vh[..., -1, :]
         gap = s[..., :-1].square() - s[..., -1:].square()
         simple = gap > 64 * torch.finfo(A.dtype).eps * s[..., :-1] * s[..., :1]
         inverse_gap = torch.where(simple, gap, torch.inf).reciprocal()
-        v = normalize(_newton_step(v, product(v), others, inverse_gap), dim=-1)
-    if not needs_gradient(A, weights):
+        image = product(v)
+        v = normalize(_newton_step(v, image.detach() if derivatives else image, others, inverse_gap), dim=-1)
+    if not derivatives:
         return v, s
     x = v
     for _ in range(2):  # each makes the derivatives of one more order right

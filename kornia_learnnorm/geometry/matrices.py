@@ -74,13 +74,15 @@ def smallest_right_singular_vector(A: Tensor) -> tuple[Tensor, Tensor]:
     eye = torch.eye(3, dtype=A.dtype, device=A.device)
     # All that a matrix of rank one leaves are the vectors orthogonal to its rows.
     M = C.mT @ C + RANK1_WEIGHT * (eye - A.mT @ A)
+    derivatives = needs_gradient(M)
+    fixed = M.detach() if derivatives else M  # `no_grad` leaves forward-mode derivatives
     with torch.no_grad():
-        v, largest = _largest_eigenvector(M)
-    if not needs_gradient(M):
+        v, largest = _largest_eigenvector(fixed)
+    if not derivatives:
         return v, C
     with torch.no_grad():
         # The inverse of H on the complement of its null vector v, where it has two eigenvalues: (tr H - H) / product.
-        H = largest * eye - M
+        H = largest * eye - fixed
         trace = H.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
         product = (trace.square() - H.square().sum((-2, -1), keepdim=True)) / 2
         simple = product > MIN_RELATIVE_GAP * largest * trace

@@ -9,7 +9,7 @@ import torch
 from pairwise import pairwise
 from references import check_gradients, derivative, in_hartley, signless, true_essential, unit, up_to_sign
 from scenes import LAYERS, correspondences, raises, scenes, shaken, uniform
-from torch.func import grad, jacrev, vmap
+from torch.func import grad, hessian, jacfwd, jacrev, vmap
 from torch.utils.checkpoint import checkpoint
 
 import kornia_learnnorm as kln
@@ -190,12 +190,16 @@ class TestGradients:
         weights = uniform(2, num_points, low=0.2)
         check_gradients(numbers, *correspondences("handheld", 2, num_points), weights, eps=1e-6, atol=1e-4)
 
+    @pytest.mark.filterwarnings("ignore:.torch.jit")  # in forward mode
     @pytest.mark.parametrize(("name", "number"), [("whitening", 8), ("learned", 8), ("hartley", 9), ("whitening", 9)])
     def test_second(self, name, number):
         layer, weights = LAYERS[name]().double(), [uniform(1, 9, low=0.2)] if number == 9 else []
         gradient = derivative(lambda *values: signless(layer(*values)))
         values = *correspondences("handheld", 1, number), *weights
         check_gradients(gradient, *values, eps=1e-4, atol=1e-3, rtol=1e-2)
+        for modes in ((jacfwd, jacrev), (hessian, lambda f: jacrev(jacrev(f)))):
+            found = [mode(lambda x: layer(x, values[1])[..., 0, :].square().sum())(values[0]) for mode in modes]
+            torch.testing.assert_close(*found, rtol=1e-5, atol=1e-8)
 
 
 class TestPrecision:
@@ -274,7 +278,7 @@ class TestBackEnds:
         finally:
             torch.use_deterministic_algorithms(False)
 
-    @pytest.mark.filterwarnings("ignore::DeprecationWarning")
+    @pytest.mark.filterwarnings("ignore:.torch.jit")
     def test_jit_is_refused(self, layer):
         raises(TypeError, r"cannot be compiled by torch\.jit", torch.jit.script, layer)
         raises(TypeError, r"cannot be compiled by torch\.jit", torch.jit.trace, layer, correspondences("handheld", 3))

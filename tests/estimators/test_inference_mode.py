@@ -43,14 +43,6 @@ def test_results_are_those_with_gradient(name):
     check_ordinary(estimate, expected)
 
 
-def test_functions_give_those_with_gradient():
-    points = inputs("linear")
-    for normalizer in (None, kln.Whitening()):
-        with torch.no_grad():
-            found = kln.find_fundamental(*points, normalizer=normalizer)
-        check_ordinary(found, kln.find_fundamental(*points, normalizer=normalizer))
-
-
 def test_vmap_without_gradient_agrees():
     layer, (points1, points2) = LAYERS["fundamental"](), inputs("fundamental")
     with torch.no_grad():
