@@ -180,5 +180,6 @@ class InlierLoss(nn.Module):
         """Return the loss of each set, (B,), of logits (B, N) and inliers (B, N): one, zero or NaN."""
         known = ~inliers.isnan()
         target = torch.where(known, inliers, 0.0).to(logits)
+        logits = torch.where(known, logits, 0.0)  # which may be NaN
         entropy = binary_cross_entropy_with_logits(logits, target, reduction="none")
         return (entropy * known).sum(-1) / known.sum(-1).clamp(min=1)

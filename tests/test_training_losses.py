@@ -109,7 +109,7 @@ class TestLossesOfSets:
         assert BoundedEpipolarLoss(2.0)(*values).tolist() == pytest.approx(expected)
         expected = [(math.log(2.5) + math.log(0.5)) / 2, (math.log(4.5) + math.log(100.5)) / 2]
         assert LogEpipolarLoss(0.5)(*values).tolist() == pytest.approx(expected)
-        logits = torch.tensor([[0.0, 2.0, -1.0], [1.0, 1.0, 1.0]])
+        logits = torch.tensor([[0.0, 2.0, torch.nan], [1.0, 1.0, 1.0]])
         inliers = torch.tensor([[1.0, 0.0, torch.nan], [torch.nan] * 3])
         expected = [(math.log(2) + math.log(1 + math.exp(2))) / 2, 0.0]
         assert kln.InlierLoss()(logits, inliers).tolist() == pytest.approx(expected)

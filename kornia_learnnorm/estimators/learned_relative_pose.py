@@ -68,8 +68,9 @@ class LearnedRelativePose(LearnedLayer):
     fundamental matrix.
 
     The order of the correspondences has no effect. Swapping the views, with their cameras, gives :math:`E^\top` up to
-    sign. Planes and cameras that move forward are solved as other scenes are; a camera that only rotates has no
-    translation, and some direction is returned. Undistort the points before where the distortion is known.
+    sign. Of five correspondences, which up to ten matrices fit exactly, rounding may choose one. Planes and cameras
+    that move forward are solved as other scenes are; a camera that only rotates has no translation, and some direction
+    is returned. Undistort the points before where the distortion is known.
 
     Args:
         width: channels of the networks.

@@ -20,7 +20,7 @@ from kornia_learnnorm.estimators.network_features import (
 from kornia_learnnorm.estimators.optimize import choose, differentiable_state
 from kornia_learnnorm.estimators.stages import few_outliers
 from kornia_learnnorm.estimators.weighted_samples import evenly_ranked, sample_null_spaces
-from kornia_learnnorm.geometry.checks import is_known_true
+from kornia_learnnorm.geometry.checks import is_known_true, safe_divisor
 from kornia_learnnorm.geometry.five_point import essential_in_span
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem
@@ -69,7 +69,7 @@ def run_pose_stages(
     states: list[Calibrated] = []
     found: list[Tensor] = []
     settled = torch.zeros_like(problem.x1[:, 0, 0], dtype=torch.bool)
-    dtype, tiny = next(networks.parameters()).dtype, torch.finfo(problem.x1.dtype).tiny
+    dtype, tiny = networks[0].stem.weight.dtype, torch.finfo(problem.x1.dtype).tiny
     near, early, last = (NEAR, EARLY_NEAR_SCALE, LAST_NEAR_SCALE) if settle else (None, EARLY_SCALE, LAST_SCALE)
     for network in networks:
         seen, factor, before = features, None, None
@@ -91,7 +91,8 @@ def run_pose_stages(
             settled = few_outliers(logits, None if problem.weights is None else problem.weights > 0)
         weights = logits.sigmoid()
         weights = weights / weights.detach().amax(1, keepdim=True) + MIN_WEIGHT
-        weights = weights if problem.weights is None else weights * problem.weights
+        if problem.weights is not None:  # their ratios matter, not how many matches they seem to make
+            weights = weights * (problem.weights / safe_divisor(problem.weights.detach().amax(1, keepdim=True)))
         suggested = weights if factor is None else weights * factor
         found.append(logits)
         if len(found) == len(networks) or (is_known_true(settled.all()) and len(settled) > 0):
@@ -204,7 +205,7 @@ def _search_near(
     pixels = evidence.squares(state.matrix()[:, None])[0][:, 0].sqrt() * unit
     near = torch.where(pixels < NEAR_PIXELS, weights, 0.0)
     again = ((pixels < LAST_PIXELS) & front).sum(1) < FEW_INLIERS * (weights > 0).sum(1)
-    again = again & ((near > 0).sum(1) >= MIN_NEAR)
+    again = again & ((near > 0).sum(1) >= MIN_NEAR) & ~settled
     if is_known_true(~again.any()):
         return state, front
     best = state.essential()[:, None], torch.ones_like(again)[:, None]

@@ -66,7 +66,8 @@ class AttentiveContextBlock(nn.Module):
         z = self.norm(hidden)
         mean, deviation, maximum = set_statistics(z, self.attention(z), absent)
         context = self.context(maximum)
-        if not torch.compiler.is_compiling() and z.shape[1] > z.shape[2]:
+        # Not where an adapter, say of low rank, has taken the layer's place.
+        if type(self.point) is nn.Linear and not torch.compiler.is_compiling() and z.shape[1] > z.shape[2]:
             # The statistics go into a layer of each set, which then reads half as many numbers.
             own, relative = self.point.weight.chunk(2, 1)
             relative = relative / deviation

@@ -37,7 +37,7 @@ def run_stages(layer: Any, problem: LinearProblem, scores: Tensor | None) -> tup
     found: list[tuple[Tensor, Tensor]] = []
     with torch.set_grad_enabled(torch.is_grad_enabled() and not detach_stages):
         refine: Refinement = layer.refinement(model, problem, frame, layer.samples, not layer.training)
-    dtype = next(layer.networks.parameters()).dtype
+    dtype = layer.networks[0].stem.weight.dtype  # replicas of nn.DataParallel have no parameters
     settled: Tensor | None = None
     for network in layer.networks:
         if refine.all_settled:

@@ -34,6 +34,8 @@ def test_block_against_numpy(number, masked):
     expected = [reference(block, h, a) for h, a in zip(hidden.numpy(), absent.numpy(), strict=True)]
     with torch.no_grad():
         np.testing.assert_allclose(block(hidden, absent if masked else None), expected, rtol=1e-9)
+        block.point.__class__ = type("Adapted", (torch.nn.Linear,), {"forward": lambda self, x: 0 * x - 1e9})
+        assert torch.allclose(block(hidden, absent if masked else None), hidden + block.out.bias)
 
 
 @pytest.mark.parametrize("number", [FEW, MANY])

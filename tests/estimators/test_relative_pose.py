@@ -101,6 +101,8 @@ def test_cameras_are_left_where_matches_contradict_them():
     assert torch.equal(errors[1], errors[2])  # a pose without cameras has to fit the correspondences
     points = scene.points1, scene.points2
     kept = layer(*points, *cameras)
+    few, alike = [p[:, :40] for p in moved], torch.ones(8, 40)
+    assert up_to_sign(layer(*few, *cameras, alike * 1e3).detach(), layer(*few, *cameras, alike).detach()) < 1e-4
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(camera_evidence, "MIN_EFFECT", torch.inf)
         assert torch.equal(kept, layer(*points, *cameras))
