@@ -22,6 +22,7 @@ LM_RELAXATION = 1.4  # of those on the manifold
 TOLERANCE = 1e-3  # cosine of distances and derivatives at which a matrix has converged
 POSE_PIXELS = 2.0  # scale at which the pose of a matrix that left the cameras must still fit
 POOL_SIZE = 2  # best hypotheses, of which correspondences in front of both cameras choose one
+MIN_FRONT_GAIN = 1.1  # of another one over these: of the two poses of a plane, one has many behind a camera
 
 
 def fit_final(scorer: PairScorer, pool: Hypotheses) -> Any:
@@ -30,7 +31,7 @@ def fit_final(scorer: PairScorer, pool: Hypotheses) -> Any:
     loss = GemanMcClure(LOSS_SCALE * threshold)
     fit = model.reweighted_fit(scorer.x1, scorer.x2, pool.F_mat, [Truncated(threshold), *STEPS * [loss]])
     if fit is None:
-        return _fit_on_manifold(scorer, pool.F_mat[:POOL_SIZE], loss)
+        return _fit_on_manifold(scorer, pool.F_mat, loss)
     best = int(fit.cost.argmin())
     state, cost = model.state(fit.F_mat[best : best + 1]), float(fit.cost[best])
     if not float(fit.gain[best]) <= MIN_GAIN:
@@ -43,7 +44,7 @@ def fit_final(scorer: PairScorer, pool: Hypotheses) -> Any:
 
 
 def _fit_on_manifold(scorer: PairScorer, M: Tensor, loss: Loss) -> Any:
-    """Return the state of the optimum of the model that is next to the best of some matrices (K, 3, 3).
+    """Return the state of the optimum of the model that is next to the best of matrices (K, 3, 3), best first.
 
     Correspondences behind a camera are mismatches: they neither vote nor count in the fit. Where the correspondences
     contradict the cameras, the optimum is that of fundamental matrices, if its pose still fits.
@@ -55,7 +56,9 @@ def _fit_on_manifold(scorer: PairScorer, M: Tensor, loss: Loss) -> Any:
     if isinstance(model, Essential):
         evidence = Evidence.from_points(scorer.x1[None], scorer.x2[None])
         weights = in_front_of_best_pose(evidence, state, gains[None], len(M))[0].to(gains)
-    best = int((gains * weights).sum(-1).argmax())
+    votes = (gains * weights).sum(-1)
+    best, other = int(votes[:POOL_SIZE].argmax()), int(votes.argmax())
+    best = other if float(votes[other]) > MIN_FRONT_GAIN * float(votes[best]) else best
     state, weights = type(state)(*(value[best : best + 1] for value in state)), weights[best : best + 1]
     losses = Truncated(scorer.threshold), loss
     near, last = (scorer.cost(rho, weights=weights)._replace(relaxation=LM_RELAXATION) for rho in losses)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from references import cross, homogeneous, up_to_sign
-from scenes import distorted, one_scene, uniform
+from scenes import distorted, one_scene, seeded, uniform
 
 import kornia_learnnorm as kln
 from kornia_learnnorm import RANSAC
@@ -19,12 +19,12 @@ def pair(name: str = "handheld", num_points: int = 200, noise: float = 0.3, outl
     return (scene.points1, scene.points2), (scene.K1, scene.K2), E_mat, scene.inliers
 
 
-def plane(num_points: int = 60, off_plane: int = 0, seed: int = 0):
+def plane(num_points: int = 60, off_plane: int = 0, seed: int = 0, normal=(0.2, -0.1, 1.0)):
     """Noise-free correspondences of a plane, and some points behind it; both cameras, their E, R and t."""
     scene = one_scene("handheld", num_points, seed, noise=0.0, outliers=0.0)
     K1, K2, R, t = (value.numpy() for value in (scene.K1, scene.K2, scene.R, scene.t))
     rays = homogeneous(scene.points1.numpy()) @ np.linalg.inv(K1).T
-    depth = 4 / (rays @ np.array([0.2, -0.1, 1.0]))
+    depth = 4 / (rays @ np.array(normal))
     depth[:off_plane] *= np.linspace(1.2, 3, off_plane)
     x2 = (depth[:, None] * rays @ R.T + 0.5 * t / np.linalg.norm(t)) @ K2.T
     points = scene.points1, torch.from_numpy(x2[:, :2] / x2[:, 2:])
@@ -79,6 +79,18 @@ class TestAccuracy:
         _, rotations, translations, _ = cv2.decomposeHomographyMat(H, np.eye(3))
         solutions = [cross(t[:, 0]) @ R for R, t in zip(rotations, translations, strict=True)]
         assert min(up_to_sign(found.E_mat[None], E[None]) for E in solutions) < 1e-5
+
+    def test_of_the_poses_of_a_plane_the_one_in_front(self):
+        behind = []  # share of the inliers
+        for seed in range(24):
+            views, cameras, *_ = plane(300, 0, seed, (0.4, -0.3, 1.0))
+            views = [x + 0.3 * torch.randn(300, 2, generator=seeded(seed + k)).double() for k, x in enumerate(views)]
+            views[1][:150] = uniform(150, 2, high=480.0, seed=seed)
+            found = estimate(views, cameras)
+            given = [value[None] for value in (*cameras, *views)]
+            R, t = kln.relative_pose(found.F_mat[None], *given, found.inliers[None])
+            behind.append((~in_front(R[None], t[None], *given)[0, 0])[found.inliers].double().mean())
+        assert np.mean(behind) < 0.02
 
     def test_final_fit_is_the_optimum_of_its_loss(self):
         points, cameras, _, _ = pair(outliers=0.2)
