@@ -28,7 +28,7 @@ from kornia_learnnorm.two_view.pair_warnings import (
     find_warnings,
     log_false_alarms,
 )
-from kornia_learnnorm.two_view.parallax import MAX_LOG_CHANCE_PARALLAX
+from kornia_learnnorm.two_view.parallax import MAX_LOG_CHANCE_PARALLAX, OFF_PLANE
 from kornia_learnnorm.two_view.plane_pose import angle_between, plane_poses
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.two_view.solver import MIN_MATCHES, Solution, TwoViewSolver
@@ -36,6 +36,7 @@ from kornia_learnnorm.two_view.solver import MIN_MATCHES, Solution, TwoViewSolve
 MIN_MOTION = 0.1  # pixels, median over the matches; below, the camera has not moved
 MIN_RIVAL_SHARE = 0.6  # of the inliers; number of outliers that must agree on a second matrix for a warning
 MIN_RIVAL_ANGLE = 15.0  # degrees between the poses of both matrices for a warning
+MIN_DEVIATIONS = 3.0  # by which matches off a plane must prefer one of its poses, or a warning tells of the other
 MIN_FREE_GAIN = 1.25  # inliers without cameras over inliers with them for a warning of wrong cameras
 MIN_FREE_SHARE = 0.25  # of the matches; inliers without cameras for this warning, as false matches agree on some matrix
 # Fields of PairEstimate, those of a pose only where there is one; standard errors; reasons for doubt.
@@ -208,9 +209,17 @@ def _answer_homography(solver: TwoViewSolver, H_mat: Tensor, F_mat: Tensor | Non
     if not poses:
         text = "no plane in front of both cameras has this homography"
         return fields, predicted_error.predict_transfer_error(*about), (PairWarning("no_pose", text),)
+    doubts: tuple[PairWarning, ...] = ()
     if len(poses) > 1:  # matches off the plane agree with the true pose alone
-        support = solver.support(torch.stack([pose.fundamental(*cameras) for pose in poses]))
-        poses = [poses[row] for row in support.argsort(descending=True, stable=True).tolist()]
+        near = solver.distance(torch.stack([pose.fundamental(*cameras) for pose in poses])) < solver.threshold
+        order = near.sum(-1).argsort(descending=True, stable=True).tolist()
+        poses = [poses[row] for row in order]
+        off_plane = solver.distance(H_mat, "homography") > OFF_PLANE * solver.threshold
+        first, second = (int((near[row] & off_plane).sum()) for row in order[:2])
+        angle = angle_between(poses[0], poses[1:])
+        if first - second <= MIN_DEVIATIONS * math.sqrt(first + second) and angle > MIN_RIVAL_ANGLE:
+            text = f"the plane has a second pose, {angle:.0f} degrees away (other_pose): too few matches off it decide"
+            doubts = (PairWarning("ambiguous", text),)
     (R, t, n), *others = poses
     angles = torch.tensor([angle_between(poses[0], plane_poses(part, *seen)) for part in found.parts]).double()
     fields["R"] = R
@@ -218,4 +227,4 @@ def _answer_homography(solver: TwoViewSolver, H_mat: Tensor, F_mat: Tensor | Non
         front = in_front(R[None, None], t[None, None], *(value[None] for value in (*cameras, *matches)))[0, 0]
         fields |= {"F_mat": poses[0].fundamental(*cameras), "E_mat": poses[0].essential(), "t": t, "n": n}
         fields |= {"front": front, "other_pose": others[0] if others else None}
-    return fields, predicted_error.predict_transfer_error(*about, angles), ()
+    return fields, predicted_error.predict_transfer_error(*about, angles), doubts

@@ -26,10 +26,12 @@ from kornia_learnnorm.geometry.transforms import affine_transform
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.models.two_view_model import Residuals
 from kornia_learnnorm.ransac.final_fit import LOSS_SCALE
+from kornia_learnnorm.ransac.samplers import draw_distinct
 from kornia_learnnorm.ransac.scoring import PairScorer
 
 OFF_PLANE = 2.0  # thresholds, or standard deviations; a match that the homography misses by more is off the plane
 MAX_SAMPLES = 1000  # pairs of matches off the plane that are tried
+MAX_PAIRED = 2000  # matches off the plane of which all pairs are listed
 MIN_PARALLAX_INLIERS = 3  # matches off the plane that a matrix must have to be more than a choice of two
 MAX_DISTORTION = 0.2  # of the radius at the corners of an image
 MAX_LM_STEPS = 10
@@ -169,8 +171,12 @@ def fit_plane_and_parallax(points1: Tensor, points2: Tensor, H: Tensor, threshol
     off = (parallax(points1, points2, H) > OFF_PLANE * threshold).nonzero()[:, 0]
     if len(off) < MIN_PARALLAX_INLIERS:
         return None
-    pairs = torch.combinations(off)
-    chosen = pairs[torch.randperm(len(pairs), generator=torch.Generator().manual_seed(seed))[:MAX_SAMPLES]]
+    generator = torch.Generator().manual_seed(seed)
+    if len(off) <= MAX_PAIRED:
+        pairs = torch.combinations(off)
+        chosen = pairs[torch.randperm(len(pairs), generator=generator)[:MAX_SAMPLES]]
+    else:  # the time and memory of all pairs grow with the square of the matches
+        chosen = off[draw_distinct(torch.full((MAX_SAMPLES,), len(off)), 2, generator)]
     x1, x2 = (convert_points_to_homogeneous(points[chosen]) for points in (points1, points2))
     epipole = torch.linalg.cross(*torch.linalg.cross(x1 @ H.mT, x2).unbind(1))
     scorer = PairScorer(points1, points2, threshold, Fundamental())

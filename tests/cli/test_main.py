@@ -325,13 +325,6 @@ def test_configurations_are_found_by_name_from_any_folder(tmp_path, monkeypatch,
     assert find_config("crossview") == Path("crossview")
 
 
-def test_configurations_take_the_accelerator_that_is_there():
-    for path in FOLDER.rglob("*.yaml"):
-        trainer = yaml.safe_load(path.read_text()).get("trainer", {})
-        assert trainer.get("accelerator", "auto") == "auto", path
-        assert "accelerator" in trainer or path.parent != FOLDER, path
-
-
 def help_of(*words):
     """What ``--help`` prints."""
     with contextlib.redirect_stdout(io.StringIO()) as printed, pytest.raises(SystemExit) as caught:
@@ -360,11 +353,3 @@ def test_help_of_a_training_lists_all_options_or_needs_no_extra(monkeypatch):
     for module in ("lightning_modules.training_command", "pytorch_lightning", "jsonargparse", "yaml"):
         monkeypatch.setitem(sys.modules, module, None)
     assert "--help-all" in help_of("fit", "--config", "crossview", "-h")
-
-
-@pytest.mark.parametrize("words", ["config crossview", "completion bash"])
-def test_bad_usage_exits_with_2(words, capsys):
-    with pytest.raises(SystemExit, match="2"):
-        main([*words.split(), "--unheard", "of"])
-    hint = "unrecognized arguments: --unheard of; learnnorm"
-    assert f"learnnorm {words.split()[0]}: error: {hint}" in capsys.readouterr().err
