@@ -36,7 +36,7 @@ def check_tensor(name: str, value: object, shape: Sequence[str] | None = None, p
 
 
 def check_cameras(K1: Tensor | None, K2: Tensor | None, batch_size: int | None = None) -> None:
-    """Raise a clear error for anything but two finite and invertible cameras with a last row (0, 0, w), or none.
+    """Raise a clear error for anything but two finite and invertible cameras with a last row (0, 0, w > 0), or none.
 
     Cameras are (3, 3), or (B, 3, 3) where there is a ``batch_size``. A last row of other numbers is a ValueError that
     names a transposed camera.
@@ -53,10 +53,10 @@ def check_cameras(K1: Tensor | None, K2: Tensor | None, batch_size: int | None =
         wrong = ~K.isfinite().flatten(-2).all(-1) | (torch.linalg.det(K.detach().to(solve_dtype(K.device))) == 0)
         if read_condition(wrong.any()):
             raise ValueError(f"{name} must be finite and invertible, got {K.detach()[wrong][0].tolist()}")
-        if read_condition((K[..., 2, :2] != 0).any()):
-            rows = K.detach().reshape(-1, 3, 3)[:, 2]
-            got = " ".join(f"{value:g}" for value in rows[(rows[:, :2] != 0).any(-1)][0].tolist())
-            raise ValueError(f"{name} must have a last row of 0 0 1, up to scale, got {got}; is it transposed?")
+        wrong = (K[..., 2, :2] != 0).any(-1) | (K[..., 2, 2] <= 0)
+        if read_condition(wrong.any()):
+            got = " ".join(f"{value:g}" for value in K.detach()[wrong][0, 2].tolist())
+            raise ValueError(f"{name} must have a last row of 0 0 1, up to a positive scale, got {got}; transposed?")
 
 
 def check_correspondences(points1: Tensor, points2: Tensor, weights: Tensor | None = None, min_points: int = 8) -> None:

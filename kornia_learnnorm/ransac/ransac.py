@@ -198,7 +198,7 @@ class RANSAC(nn.Module):
             ShapeError: if a shape is wrong.
             ValueError: if there are fewer than eight rows, or five with cameras, the views do not pair up, a weight is
                 negative or not finite, only one camera is given, or one is not a finite and invertible (3, 3) matrix
-                with a last row of (0, 0, w).
+                with a last row of (0, 0, w > 0).
         """
         check_cameras(K1, K2)
         if K1 is not None and not isinstance(self.model, Fundamental):
