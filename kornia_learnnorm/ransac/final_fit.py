@@ -50,15 +50,18 @@ def _fit_on_manifold(scorer: PairScorer, M: Tensor, loss: Loss) -> Any:
     contradict the cameras, the optimum is that of fundamental matrices, if its pose still fits.
     """
     model = scorer.model
-    state: Any = model.state(M)
-    gains = (1 - (scorer.distances(M) / scorer.threshold).square()).clamp(min=0).nan_to_num(0.0)
-    weights, evidence = torch.ones_like(gains), None
-    if isinstance(model, Essential):
-        evidence = Evidence.from_points(scorer.x1[None], scorer.x2[None])
-        weights = in_front_of_best_pose(evidence, state, gains[None], len(M))[0].to(gains)
-    votes = (gains * weights).sum(-1)
-    best, other = int(votes[:POOL_SIZE].argmax()), int(votes.argmax())
-    best = other if float(votes[other]) > MIN_FRONT_GAIN * float(votes[best]) else best
+    evidence = Evidence.from_points(scorer.x1[None], scorer.x2[None]) if isinstance(model, Essential) else None
+    for pool in (M[:POOL_SIZE], M):
+        state: Any = model.state(pool)
+        gains = (1 - (scorer.distances(pool) / scorer.threshold).square()).clamp(min=0).nan_to_num(0.0)
+        weights = torch.ones_like(gains)
+        if evidence is not None:
+            weights = in_front_of_best_pose(evidence, state, gains[None], len(pool))[0].to(gains)
+        votes = (gains * weights).sum(-1)
+        best, other = int(votes[:POOL_SIZE].argmax()), int(votes.argmax())
+        best = other if float(votes[other]) > MIN_FRONT_GAIN * float(votes[best]) else best
+        if float(gains[best].sum()) <= MIN_FRONT_GAIN * float(votes[best]):
+            break  # no other one can have so many more
     state, weights = type(state)(*(value[best : best + 1] for value in state)), weights[best : best + 1]
     losses = Truncated(scorer.threshold), loss
     near, last = (scorer.cost(rho, weights=weights)._replace(relaxation=LM_RELAXATION) for rho in losses)
