@@ -6,6 +6,7 @@ Formulas are set by a MathJax that is copied into the site, so that the pages ne
 import os
 import re
 import sys
+import tomllib
 from pathlib import Path
 
 import nbformat
@@ -60,6 +61,12 @@ nb_execution_timeout = 900  # seconds a cell; a busy machine takes many times as
 nb_merge_streams = True
 nb_render_markdown_format = "myst"
 
+# Colab opens notebooks of repositories on GitHub: the workflow pages.yml pushes those of the tutorials to a branch.
+PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+REPOSITORY = PROJECT["urls"].get("Repository", "").rstrip("/")
+COLAB = REPOSITORY.replace("https://github.com", "https://colab.research.google.com/github") + "/blob/notebooks"
+INSTALL = f"%pip install --quiet 'kornia-learnnorm[train,images,report] @ git+{REPOSITORY}'\n%env DOWNLOAD=1"
+
 ROLE = re.compile(r"\{[\w:-]+\}`[~./]*([^`<]+?)(\s*<[^`]*>)?`")  # text, and a target where the text is not it
 
 
@@ -106,13 +113,23 @@ def _plain_notebook(app, doctree):
         if cell.cell_type == "markdown":
             lines = [line for line in cell.source.splitlines() if "{nb-download}" not in line]
             cell.source = ROLE.sub(lambda role: role[1] if role[2] else f"`{role[1]}`", "\n".join(lines))
+    if REPOSITORY:
+        notebook.cells.insert(0, nbformat.v4.new_code_cell(INSTALL))
     nbformat.write(notebook, path)
+
+
+def _link_colab(app, docname, source):
+    """Add a link to Colab behind that to the notebook of a tutorial."""
+    if REPOSITORY and docname.startswith("tutorials/"):
+        link = f"[Open it in Colab]({COLAB}/{Path(docname).name}.ipynb)."
+        source[0] = re.sub(r"^(\{nb-download\}.*)$", rf"\1 {link}", source[0], count=1, flags=re.MULTILINE)
 
 
 def setup(app):
     """Connect what the settings above cannot say."""
     # It adds a file to the site and reads no page, but does not declare that it is safe for parallel reading.
     app.extensions["sphinx-mathjax-offline"].parallel_read_safe = True
+    app.connect("source-read", _link_colab)
     app.connect("doctree-read", _plain_notebook)
     # The kernels of the pages inherit the style of figures, results_tables.py, and a path that has learnnorm.
     os.environ["MATPLOTLIBRC"] = str(app.confdir)

@@ -1,6 +1,7 @@
 """The package: names of its files, what importing it loads; its wheel, with configurations and weights."""
 
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -47,6 +48,18 @@ def test_the_wheel_has_configurations_and_weights(wheels):
     assert tops == {"kornia_learnnorm", "lightning_modules", "kornia_learnnorm_command.py", information}
     entry_points = zipfile.ZipFile(wheels[0]).read(f"{information}/entry_points.txt").decode()
     assert "learnnorm = kornia_learnnorm_command:main" in entry_points  # where an interrupted import is caught
+
+
+def test_readme_of_an_index_has_absolute_links(monkeypatch):
+    pytest.importorskip("hatchling", reason="hatchling is not installed")
+    monkeypatch.syspath_prepend(ROOT)
+    metadata = {"urls": {"Repository": "https://github.com/owner/name/"}}
+    import_module("hatch_build").Readme(str(ROOT), {}).update(metadata)
+    text, readme = metadata["readme"]["text"], (ROOT / "README.md").read_text(encoding="utf-8")
+    links = re.findall(r"\]\((.*?)\)|src=\"(.*?)\"", text)
+    assert [link for link in links if not "".join(link).startswith("https://")] == []
+    assert text.count("https://github.com/owner/name/raw/main/docs/images/") == 2
+    assert re.sub("https://github.com/owner/name/(blob|raw)/main/", "", text) == readme
 
 
 def test_the_wheel_finds_its_configurations_in_any_folder(wheels, tmp_path):
