@@ -30,7 +30,6 @@ def wheels(tmp_path_factory):
 
 
 def test_two_builds_are_the_same(wheels):
-    assert wheels[0].name == wheels[1].name
     assert wheels[0].name.startswith(f"kornia_learnnorm-{kln.__version__}-")
     assert wheels[0].read_bytes() == wheels[1].read_bytes()
     assert wheels[0].stat().st_size < 4e6
@@ -56,9 +55,7 @@ def test_readme_of_an_index_has_absolute_links(monkeypatch):
     metadata = {"urls": {"Repository": "https://github.com/owner/name/"}}
     import_module("hatch_build").Readme(str(ROOT), {}).update(metadata)
     text, readme = metadata["readme"]["text"], (ROOT / "README.md").read_text(encoding="utf-8")
-    links = re.findall(r"\]\((.*?)\)|src=\"(.*?)\"", text)
-    assert [link for link in links if not "".join(link).startswith("https://")] == []
-    assert text.count("https://github.com/owner/name/raw/main/docs/images/") == 2
+    assert re.findall(r"\]\((?!https://)[^)]*|src=\"(?!https://)[^\"]*", text) == []
     assert re.sub("https://github.com/owner/name/(blob|raw)/main/", "", text) == readme
 
 

@@ -97,6 +97,8 @@ def estimate_matches(
     given = None if unknown[0] else size1, None if unknown[1] else size2
     with without_autocast(points1):
         solver = TwoViewSolver(points1, points2, scores, threshold, seed, layer, cameras)
+        free = 0 if cameras is None else solver.free_support()
+        solver = solver if cameras is None else solver.expect(free)
         choice, found, H_mat = choose_model(solver, model, size1, size2)
         F_mat = None if found is None else found.matrix
         if choice.model == "homography":
@@ -106,7 +108,7 @@ def estimate_matches(
         relief = choice.model == "fundamental" and choice.parallax is not None and not choice.parallax.planar
         if cameras is not None:  # a plane contradicts no cameras, but wrong cameras can make a scene look like a plane
             doubt = find_camera_doubt(cameras, given, points1, points2, F_mat if relief else None, threshold)
-            doubts += doubt or _compare_free(solver, fields)
+            doubts += doubt or _compare_free(solver, fields, free)
     if cameras is None and choice.model == "fundamental" and choice.parallax is not None and not relief:
         doubts += (PairWarning("planar", choice.parallax.describe(threshold)),)
     if model == "homography" and choice.parallax is not None and choice.parallax.log_chance <= MAX_LOG_CHANCE_PARALLAX:
@@ -169,11 +171,11 @@ def _answer_fundamental(solver: TwoViewSolver, found: Solution, size1: Size, siz
     return fields | {"R": R[0], "t": t[0], "front": in_front(R[None], t[None], K1, K2, x1, x2)[0, 0]}, error, doubts
 
 
-def _compare_free(solver: TwoViewSolver, fields: dict[str, Any]) -> tuple[PairWarning, ...]:
-    """Return a warning where many more matches agree on a matrix without cameras than on F, or are inliers of H."""
+def _compare_free(solver: TwoViewSolver, fields: dict[str, Any], free: int) -> tuple[PairWarning, ...]:
+    """Return a warning where many more matches, ``free``, agree on a matrix without cameras than on F or H."""
     if fields["F_mat"] is None:
         return ()
-    agree, free = max(int(solver.support(fields["F_mat"])), int(fields["inliers"].sum())), solver.free_support()
+    agree = max(int(solver.support(fields["F_mat"])), int(fields["inliers"].sum()))
     if free < max(MIN_FREE_GAIN * agree, MIN_FREE_SHARE * len(solver.scores)):
         return ()
     return (PairWarning("cameras", f"{CONTRADICTION}: without them {free} matches agree, with them {agree}"),)

@@ -1,5 +1,6 @@
 """The matrices of matches by RANSAC or a learned layer, plane and parallax, and parts of the matches."""
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, NamedTuple, Self
@@ -13,6 +14,7 @@ from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.matrices import unit_matrix
+from kornia_learnnorm.models.essential import Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.models.homography import Homography
 from kornia_learnnorm.ransac.final_fit import LOSS_SCALE, fit_final
@@ -32,7 +34,10 @@ NEAR = 20.0  # thresholds; among the matches this near a matrix, fewer are false
 MIN_NEAR = 16  # matches near a matrix, for a search among them
 MAX_NEAR_SEARCHES = 3
 MIN_INLIER_SHARE = 0.5  # of the matches; with as many inliers, the first search finds the best matrix
+MAX_SAMPLES = 50_000  # of RANSAC
 PART_SAMPLES = 5_000  # of five matches of a part: where a quarter are inliers, one has no outlier with 99 %
+FREE_SHARE = 0.8  # of the inliers without cameras: right cameras leave an essential matrix more
+MISSED = 1e-4  # probability that no sample has inliers alone
 MIN_LOSS_SCALE = 1e-3  # thresholds; of the loss for matches without noise
 FEW_MATCHES = 400  # so few determine a matrix only with more inliers than RANSAC misses again and again
 MAX_FAILED_PARTS = 6  # parts of few matches that are no better than chance, as all matches, before the search ends
@@ -59,7 +64,7 @@ class TwoViewSolver:
     seed: int
     layer: LearnedEightPoint | None = None  # estimates in the place of RANSAC
     cameras: Cameras | None = None
-    max_samples: int = 50_000  # of RANSAC
+    max_samples: int = MAX_SAMPLES  # of RANSAC with cameras
 
     def search(self, first: Solution, size2: Size) -> Solution:
         """Return the best matrix of :meth:`solve` and random parts; raise NoReliableMatrixError for few inliers."""
@@ -118,6 +123,12 @@ class TwoViewSolver:
         """Return how many matches agree on the matrix that RANSAC finds without their cameras."""
         return int(self.support(replace(self, cameras=None)._ransac().F_mat))  # noqa: SLF001 (its own class)
 
+    def expect(self, free: int) -> Self:
+        """Return the solver with as many samples as most of that support takes: wrong cameras would take all."""
+        hit_rate = (FREE_SHARE * free / len(self.scores)) ** Essential.sample_size
+        samples = MAX_SAMPLES if hit_rate == 0 else math.ceil(math.log(MISSED) / math.log1p(-hit_rate))
+        return replace(self, max_samples=min(samples, MAX_SAMPLES))
+
     def improve(self, F_mat: Tensor, F_parts: Tensor) -> Tensor:
         """Return the matrix (3, 3) of all matches, or that of a part (P, 3, 3), refined, where it scores higher."""
         best = self.scorer.best(self.scorer.from_pixels(F_parts), 1)
@@ -152,14 +163,15 @@ class TwoViewSolver:
         return float(self.scorer.best(self.scorer.from_pixels(F_mat[None]), 1).score.sum())
 
     def _ransac(self, model: Model = "fundamental") -> RansacResult:
-        ransac = RANSAC(inl_th=self.threshold, seed=self.seed, model=model, max_samples=self.max_samples)
         cameras = self.cameras or () if model == "fundamental" else ()
+        samples = self.max_samples if cameras else MAX_SAMPLES
+        ransac = RANSAC(inl_th=self.threshold, seed=self.seed, model=model, max_samples=samples)
         return ransac.estimate(self.points1, self.points2, self.scores.clamp(min=MIN_SCORE), *cameras)
 
     def _solve_parts(self, F_mat: Tensor, parts: Tensor, size2: Size) -> Tensor:
         """Return the matrices of the parts; of few matches, only of the first where these find no more than chance."""
         found = F_mat[None]
-        solver = self if self.cameras is None else replace(self, max_samples=PART_SAMPLES)
+        solver = replace(self, max_samples=min(self.max_samples, PART_SAMPLES))
         for tried, rows in enumerate(parts, 1):
             found = torch.cat([found, solver.part(rows).solve().matrix[None]])
             if len(self.scores) > FEW_MATCHES:  # a late part can find what all others missed

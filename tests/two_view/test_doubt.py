@@ -16,6 +16,7 @@ from kornia_learnnorm.data.synthetic.random_matches import random_planes
 from kornia_learnnorm.metrics.poses import pose_error
 from kornia_learnnorm.two_view import pair_warnings, predicted_error
 from kornia_learnnorm.two_view.pair_warnings import drop_contradiction, find_warnings, log_false_alarms
+from kornia_learnnorm.two_view.solver import TwoViewSolver
 
 
 def test_failed_searches_do_not_count():
@@ -147,6 +148,11 @@ def test_warnings_of_an_estimate():
         assert len(warned) == (text is not None)
         assert text is None or text in warned[0]
         assert len(drop_contradiction(found.warnings)) == len(found.warnings) - ("contradict" in str(text))
+
+
+def test_samples_with_cameras_are_those_that_the_support_without_them_takes():
+    solver = TwoViewSolver(*POINTS, torch.ones(300), 1.0, 0, cameras=(K, K))
+    assert [solver.expect(free).max_samples for free in (0, 150, 300)] == [50_000, 895, 24]
 
 
 def test_cameras_that_cannot_be():

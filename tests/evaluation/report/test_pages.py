@@ -95,7 +95,6 @@ def test_incomplete_robust_run(robust_copied):
     text = (robust_copied / "report.md").read_text()
     assert "Not there yet, so left out: RANSAC (kitti_06, filtered)." in text
     assert "Left out, since not installed: poselib." in text
-    assert "| poselib" not in text
     cells = read_robust(robust_copied).cells
     assert "RANSAC" not in cells[0].estimates
     assert "RANSAC" in cells[1].estimates
@@ -110,5 +109,4 @@ def test_only_tables_that_fit_are_printed(monkeypatch, capsys, columns, header):
     text = capsys.readouterr().out
     assert "12.3 [10.0, 14.0]" in text
     assert f" {header} │" in text
-    assert "…" not in text
     assert text.endswith(f"wider than the {columns} columns of this terminal, see report.html:\n  Wide\n")
