@@ -98,7 +98,7 @@ def estimate_matches(
     with without_autocast(points1):
         solver = TwoViewSolver(points1, points2, scores, threshold, seed, layer, cameras)
         free = 0 if cameras is None else solver.free_support()
-        solver = solver if cameras is None else solver.expect(free)
+        solver = solver if cameras is None else solver.limit_samples(free)
         choice, found, H_mat = choose_model(solver, model, size1, size2)
         F_mat = None if found is None else found.matrix
         if choice.model == "homography":

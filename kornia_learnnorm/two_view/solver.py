@@ -36,8 +36,8 @@ MAX_NEAR_SEARCHES = 3
 MIN_INLIER_SHARE = 0.5  # of the matches; with as many inliers, the first search finds the best matrix
 MAX_SAMPLES = 50_000  # of RANSAC
 PART_SAMPLES = 5_000  # of five matches of a part: where a quarter are inliers, one has no outlier with 99 %
-FREE_SHARE = 0.8  # of the inliers without cameras: right cameras leave an essential matrix more
-MISSED = 1e-4  # probability that no sample has inliers alone
+FREE_SHARE = 0.8  # of the inliers without cameras, which right cameras exceed
+MISSED = 1e-4  # probability that no sample is free of outliers
 MIN_LOSS_SCALE = 1e-3  # thresholds; of the loss for matches without noise
 FEW_MATCHES = 400  # so few determine a matrix only with more inliers than RANSAC misses again and again
 MAX_FAILED_PARTS = 6  # parts of few matches that are no better than chance, as all matches, before the search ends
@@ -123,8 +123,11 @@ class TwoViewSolver:
         """Return how many matches agree on the matrix that RANSAC finds without their cameras."""
         return int(self.support(replace(self, cameras=None)._ransac().F_mat))  # noqa: SLF001 (its own class)
 
-    def expect(self, free: int) -> Self:
-        """Return the solver with as many samples as most of that support takes: wrong cameras would take all."""
+    def limit_samples(self, free: int) -> Self:
+        """Return the solver with the samples with cameras that 0.8 of ``free``, the inliers without cameras, take.
+
+        Right cameras have more inliers. Wrong ones have fewer, and RANSAC would draw all samples in vain.
+        """
         hit_rate = (FREE_SHARE * free / len(self.scores)) ** Essential.sample_size
         samples = MAX_SAMPLES if hit_rate == 0 else math.ceil(math.log(MISSED) / math.log1p(-hit_rate))
         return replace(self, max_samples=min(samples, MAX_SAMPLES))

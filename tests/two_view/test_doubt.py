@@ -152,7 +152,7 @@ def test_warnings_of_an_estimate():
 
 def test_samples_with_cameras_are_those_that_the_support_without_them_takes():
     solver = TwoViewSolver(*POINTS, torch.ones(300), 1.0, 0, cameras=(K, K))
-    assert [solver.expect(free).max_samples for free in (0, 150, 300)] == [50_000, 895, 24]
+    assert [solver.limit_samples(free).max_samples for free in (0, 150, 300)] == [50_000, 895, 24]
 
 
 def test_cameras_that_cannot_be():
