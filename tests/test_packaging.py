@@ -50,7 +50,6 @@ def test_the_wheel_has_configurations_and_weights(wheels):
 
 
 def test_readme_of_an_index_has_absolute_links(monkeypatch):
-    pytest.importorskip("hatchling", reason="hatchling is not installed")
     monkeypatch.syspath_prepend(ROOT)
     metadata = {"urls": {"Repository": "https://github.com/owner/name/"}}
     import_module("hatch_build").Readme(str(ROOT), {}).update(metadata)

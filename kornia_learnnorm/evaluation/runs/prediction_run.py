@@ -214,7 +214,11 @@ def _samples(
     path: Path, place: str, options: SampleOptions, store: CorrespondenceStore, max_ratio: float | None
 ) -> MatchSets:
     """Return the samples within the limit on the residual; write all that were drawn."""
-    drawn, limit = options.draw(store, max_ratio), options.max_residual
+    limit = options.max_residual
+    try:
+        drawn = options.draw(store, max_ratio)
+    except ValueError as error:
+        raise ValueError(f"{place}: {error}") from error
     if not path.is_file():
         residual = plain_residual(drawn.points1, drawn.points2).numpy()
         if not (residual < limit).any():

@@ -183,6 +183,7 @@ def test_options_that_are_refused(store, tmp_path, monkeypatch, refused):
     Path("FILE").touch()
     for options, message in [
         (["--out", ""], "--out is empty: expected a folder"),
+        (["--size", "999"], "scenes, filtered: no pair of the store has 999 correspondences"),
         (["--out", "FILE"], "FILE is a file: expected a folder"),
         (["--out", "RUN", "--max-samples", "-1"], "--max-samples must be 0, for all, or more, got -1"),
         (["--out", "RUN", "--max-residual", "-1"], "--max-residual must be 0 or more, inf for all, got -1"),
