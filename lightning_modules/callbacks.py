@@ -195,7 +195,8 @@ class ExportWeights(Callback):
         except (TypeError, ValueError) as error:
             raise ValueError(f"the trained weights could not be saved: {error}") from error
         if isinstance(trained, LearnedNormalizer):
-            _try_out(loaded, pl_module.loss)
+            source = getattr(getattr(trainer, "datamodule", None), "train", None)
+            _try_out(loaded, pl_module.loss, getattr(source, "num_heldout", 8))
 
     def on_fit_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Save the module; a ValueError in the place of untrained weights."""
@@ -210,12 +211,17 @@ class ExportWeights(Callback):
             print(f"wrote {path}")
 
 
-def _try_out(normalizer: LearnedNormalizer, loss: Any) -> None:
+def _try_out(normalizer: LearnedNormalizer, loss: Any, num_heldout: int) -> None:
     """Raise a ValueError in one line where an own network or loss fails on an example, or sends no gradient."""
     points1, points2 = 500 * torch.rand(2, 2, 8, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     try:
         F_mat = EightPoint(normalizer)(points1, points2)
-        value = F_mat if isinstance(loss, SetLoss) else loss(points1, points2, F_mat, points1, points2)
+        heldout = points1[:, :1].expand(-1, num_heldout, -1), points2[:, :1].expand(-1, num_heldout, -1)
+        value = F_mat if isinstance(loss, SetLoss) else loss(points1, points2, F_mat, *heldout)
+        if not isinstance(value, Tensor):
+            raise TypeError(f"the loss must return a tensor, got {type(value).__name__}")
+        if not num_heldout and bool(value.isnan().any()):
+            raise ValueError("the loss is NaN without held-out points: set num_heldout of the data")
     except Exception as error:  # code that is not this package's can raise anything
         text = " ".join(str(error).split())
         hint = ": register its tensors as buffers" if " meta " in text else ""

@@ -80,8 +80,8 @@ def estimate_matches(
         model: ``"auto"``, ``"fundamental"`` or ``"homography"``.
 
     Returns:
-        the estimate; its matches are the given ones but for those left out, those that share a point with one of a
-        higher score, and those that do not move at all, as on an overlay.
+        the estimate; its matches are the given ones, ``rows`` says which, but for those left out, those that share a
+        point with one of a higher score, and those that do not move at all, as on an overlay.
 
     Raises:
         NoReliableMatrixError: if there are fewer than nine matches or inliers, or no motion.
@@ -91,7 +91,9 @@ def estimate_matches(
     """
     check_settings(threshold, seed, layer, model)
     cameras = read_cameras(K1, K2)
-    points1, points2, scores = _usable(*read_matches(points1, points2, scores), threshold)
+    points1, points2, scores = read_matches(points1, points2, scores)
+    rows = _usable_rows(points1, points2, scores, threshold)
+    points1, points2, scores = points1[rows], points2[rows], scores[rows]
     unknown = size1 is None, size2 is None
     size1, size2 = read_size("size1", size1, points1), read_size("size2", size2, points2)
     given = None if unknown[0] else size1, None if unknown[1] else size2
@@ -129,12 +131,13 @@ def estimate_matches(
         ratio=None,
         threshold=threshold,
         seed=seed,
+        rows=rows,
     )
 
 
-def _usable(points1: Tensor, points2: Tensor, scores: Tensor, threshold: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the matches that move and share no point, best first; raise NoReliableMatrixError for too few."""
-    given, finite = len(scores), finite_and_bounded(points1, points2, threshold)
+def _usable_rows(points1: Tensor, points2: Tensor, scores: Tensor, threshold: float) -> Tensor:
+    """Return the rows of the matches that move and share no point; raise NoReliableMatrixError for too few."""
+    given, finite = len(scores), finite_and_bounded(points1, points2, threshold).nonzero()[:, 0]
     points1, points2, scores = points1[finite], points2[finite], scores[finite]
     kept = one_to_one(points1, points2, 1 - scores)
     motion = (points2 - points1).norm(dim=-1)[kept]
@@ -146,7 +149,7 @@ def _usable(points1: Tensor, points2: Tensor, scores: Tensor, threshold: float) 
     if len(kept) < MIN_MATCHES:
         text = f"{len(kept)} distinct matches of {given} are left, at least {MIN_MATCHES} are needed"
         raise NoReliableMatrixError("few_matches", text)
-    return points1[kept], points2[kept], scores[kept]
+    return finite[kept]
 
 
 def _answer_fundamental(solver: TwoViewSolver, found: Solution, size1: Size, size2: Size) -> Answer:

@@ -144,6 +144,7 @@ class MatchedPair:
             ratio=self.ratio,
             path1=self.path1,
             path2=self.path2,
+            rows=None,
         )
 
 

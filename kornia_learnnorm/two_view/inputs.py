@@ -28,6 +28,7 @@ def read_matches(points1: Points, points2: Points, scores: Points | None) -> tup
         given = (x1, x2) if scores is None else (x1, x2, score)
         shapes = " and ".join(str([*value.shape]) for value in given)
         hint = "; this takes one pair, points1[0]" if x1.ndim == 3 else ""
+        hint = "; points1[:, 0] of OpenCV's points" if x1.ndim == 3 and x1.shape[1] == 1 else hint
         raise ValueError(f"points of shape (N, 2) and scores of shape (N,) expected, got {shapes}{hint}")
     known = score[(x1.isfinite() & x2.isfinite()).all(-1)]
     wrong = known[~((known >= 0) & (known <= 1))]

@@ -75,6 +75,7 @@ class PairEstimate:
     front: Tensor | None = None  # mask of the matches in front of both cameras, (N,), bool; None without cameras
     n: Tensor | None = None  # unit normal (3,) of the plane, n^T X1 > 0; None without cameras or a plane
     other_pose: PlanePose | None = None  # second pose and normal that the plane allows; None where there is one alone
+    rows: Tensor | None = None  # place of each match among those given to estimate_matches, (N,); None of two images
 
     @property
     def model(self) -> str:

@@ -37,6 +37,9 @@ class Constant(PointNetwork):
 class Single(PointNetwork):
     def forward(self, points1, points2, weights=None):
         return self.view(points1, points2, weights)
+class Held(MedianLoss):
+    def forward(self, points1, points2, F_mat, *heldout):
+        return F_mat.sum() * heldout[0].mean()
 class Hidden(PointNetwork):
     def __init__(self):
         super().__init__()
@@ -49,9 +52,6 @@ class Detached(PointNetwork):
 class Flat(PointNetwork):
     def forward(self, *values):
         return [params[0] for params in super().forward(*values)]
-class TwoArguments(MedianLoss):
-    def forward(self, points1, points2):
-        return points1.sum()
 class Broken(MedianLoss):
     def forward(self, *points):
         return super().forward(*points) * (torch.nan if len(points[0]) > 2 else 1.0)
@@ -154,8 +154,8 @@ def test_what_fails_in_training_is_named(run, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(run)
     for option, message in [
         (f"{NETWORK}=broken_modules.Single", "must return (params1, params2), got <class 'torch.Tensor'>"),
+        ("--model.loss=broken_modules.Held", "ValueError: the loss is NaN without held-out points: set num_heldout"),
         (f"{NETWORK}=broken_modules.Flat", "params1 and params2 must have shape (B, P), got [[5], [5]]"),
-        ("--model.loss=broken_modules.TwoArguments", "TypeError: TwoArguments.forward() takes 3 positional arguments"),
         ("--model.loss=broken_modules.Broken", "20 steps in a row were skipped: no samples, or no finite gradient"),
         ("--model.loss=broken_modules.ThreeSets", "sets, got [3]"),
     ]:
