@@ -96,7 +96,6 @@ def test_any_batch_and_number_of_points_also_without_the_package(tmp_path, monke
     check_without_the_package(tmp_path / "layer.pt2", cases, tmp_path)
     with pytest.raises(AssertionError, match=r"points1.size\(\)\[1\] >= 9"):
         run(*sets(2, 8), mask=torch.ones(2, 8, dtype=torch.bool), scores=torch.ones(2, 8))
-    assert not any(value.requires_grad for value in run(points[0].requires_grad_(), points[1], **given))
 
 
 @pytest.mark.parametrize(("cls", "kind"), [(kln.LearnedRelativePose, "pose"), (kln.LearnedHomography, "homography")])
@@ -204,6 +203,5 @@ def test_wrong_arguments():
 def test_load_layer():
     kinds = {"tiny": kln.LearnedEightPoint, "pose": kln.LearnedRelativePose, "homography": kln.LearnedHomography}
     assert all(isinstance(load_layer(f"robust-{name}"), kind) for name, kind in kinds.items())
-    assert load_layer("crossview").normalizer.max_points == 12
     raises(FileNotFoundError, r"'rubust'.* crossview.* robust(?!.*refiner)", load_layer, "rubust")
     raises(ValueError, r"\.safetensors", load_layer, __file__)

@@ -5,6 +5,8 @@ import shlex
 import sys
 from pathlib import Path
 
+import torch
+
 from kornia_learnnorm.cli.match import add_matching_arguments, print_skipped
 from kornia_learnnorm.data.cameras import read_camera
 from kornia_learnnorm.data.datasets.pairing import choose_pairs
@@ -16,6 +18,7 @@ from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.two_view.colmap_database import THRESHOLD, check_database, export_colmap
 from kornia_learnnorm.two_view.inputs import check_settings
+from kornia_learnnorm.two_view.pair_warnings import find_camera_doubt
 
 EXAMPLES = """\
 learnnorm export-colmap PHOTOS --out photos.db --single-camera
@@ -56,6 +59,12 @@ def run(args: argparse.Namespace) -> int:
         raise ValueError(f"--out {args.out}: this is where the matches go, expected a name such as photos.db")
     estimation = {"layer": layer, "threshold": args.threshold, "seed": args.seed, "jobs": args.jobs}
     store, turned = _matches(args), len(args.matches) != 2
+    if K is not None and len(store):
+        points1, points2 = (torch.from_numpy(points) for points in store.matches(0, None)[:2])
+        size1, size2 = ((int(width), int(height)) for width, height in store.image_size[0])
+        camera = torch.from_numpy(K)
+        for doubt in find_camera_doubt((camera, camera), (size1, size2), points1, points2, None, args.threshold):
+            print(f"warning: {doubt.text.replace('K1', 'K')}", file=sys.stderr)
     counts = export_colmap(store, args.root, args.out, K, args.single_camera, turned=turned, **estimation)
     verified = f"{counts.verified} of {counts.pairs} pairs verified"
     inliers = f"{counts.inliers} of {counts.matches} matches are their inliers"
