@@ -137,6 +137,8 @@ class RANSAC(nn.Module):
         if rank2 is None:
             rank2 = "optimal" if normalizer is None else "projection"
         if isinstance(model, str):
+            if str(model) == "essential":
+                raise ValueError("model 'essential' is 'fundamental' called with the cameras K1 and K2")
             check_choice("model", model, ("fundamental", "homography"))
             model = Homography(distance) if model == "homography" else Fundamental(rank2, distance)
         self.model = model
