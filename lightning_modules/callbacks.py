@@ -195,8 +195,7 @@ class ExportWeights(Callback):
         except (TypeError, ValueError) as error:
             raise ValueError(f"the trained weights could not be saved: {error}") from error
         if isinstance(trained, LearnedNormalizer):
-            source = getattr(getattr(trainer, "datamodule", None), "train", None)
-            _try_out(loaded, pl_module.loss, getattr(source, "num_heldout", 8))
+            _try_out(loaded, pl_module.loss, getattr(_training_data(trainer), "num_heldout", 8))
 
     def on_fit_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Save the module; a ValueError in the place of untrained weights."""
@@ -205,8 +204,7 @@ class ExportWeights(Callback):
         if trainer.is_global_zero and isinstance(pl_module, EstimatorTask):
             path = Path(trainer.default_root_dir) / "weights.safetensors"
             path.parent.mkdir(parents=True, exist_ok=True)
-            source = getattr(getattr(trainer, "datamodule", None), "train", None)
-            pl_module.trained.trained_on = tuple(dict.fromkeys(_names_of(source)))
+            pl_module.trained.trained_on = tuple(dict.fromkeys(_names_of(_training_data(trainer))))
             pl_module.trained.save_pretrained(path)
             print(f"wrote {path}")
 
@@ -228,6 +226,10 @@ def _try_out(normalizer: LearnedNormalizer, loss: Any, num_heldout: int) -> None
         raise ValueError(f"network or loss failed on float64 points: {type(error).__name__}: {text}{hint}") from error
     if not F_mat.requires_grad or not value.requires_grad:
         raise ValueError(f"the {'loss' if F_mat.requires_grad else 'network'} sends no gradient: it cannot be trained")
+
+
+def _training_data(trainer: pl.Trainer) -> Any:
+    return getattr(getattr(trainer, "datamodule", None), "train", None)
 
 
 def _names_of(source: Any) -> list[str]:

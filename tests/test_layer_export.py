@@ -96,6 +96,7 @@ def test_any_batch_and_number_of_points_also_without_the_package(tmp_path, monke
     check_without_the_package(tmp_path / "layer.pt2", cases, tmp_path)
     with pytest.raises(AssertionError, match=r"points1.size\(\)\[1\] >= 9"):
         run(*sets(2, 8), mask=torch.ones(2, 8, dtype=torch.bool), scores=torch.ones(2, 8))
+    assert not any(value.requires_grad for value in run(points[0].requires_grad_(), points[1], **given))
 
 
 @pytest.mark.parametrize(("cls", "kind"), [(kln.LearnedRelativePose, "pose"), (kln.LearnedHomography, "homography")])

@@ -99,8 +99,9 @@ def estimate_matches(
     given = None if unknown[0] else size1, None if unknown[1] else size2
     with without_autocast(points1):
         solver = TwoViewSolver(points1, points2, scores, threshold, seed, layer, cameras)
-        free = 0 if cameras is None else solver.free_support()
-        solver = solver if cameras is None else solver.limit_samples(free)
+        free = 0
+        if cameras is not None:
+            solver = solver.limit_samples(free := solver.free_support())
         choice, found, H_mat = choose_model(solver, model, size1, size2)
         F_mat = None if found is None else found.matrix
         if choice.model == "homography":

@@ -165,8 +165,8 @@ class TestEstimateMatches:
         assert 100 < found.num_inliers <= found.num_matches <= 160
 
     def test_shared_points_count_once(self):
-        points1, points2 = make_matches(outliers=0)
-        found = kln.estimate_matches(points1, torch.where(torch.arange(160)[:, None] < 60, points2[:1], points2))
+        points1, points2 = (torch.cat([torch.full((1, 2), torch.nan), points]) for points in make_matches(outliers=0))
+        found = kln.estimate_matches(points1, torch.where(torch.arange(161)[:, None] < 61, points2[1:2], points2))
         assert found.num_matches == len(found.points2.unique(dim=0)) == 101
         assert torch.equal(points1[found.rows], found.points1)
 
