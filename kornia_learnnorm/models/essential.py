@@ -30,6 +30,7 @@ class Essential(Fundamental):
     name = "essential"
     dof = 5
     sample_size = 5
+    confidence = 0.999  # cameras leave noise less room
 
     def __init__(self, C1: Tensor, C2: Tensor, distance: Literal["sampson", "symmetric"] = "sampson") -> None:
         super().__init__(distance=distance)

@@ -44,6 +44,7 @@ class Homography(TwoViewModel):
     dof = 8
     sample_size = 4
     preferred: tuple[float, ...] = IDENTITY
+    confidence, max_batch, pool_size, prescored = 0.9999, 4096, 4, 256  # samples of four are cheap
 
     def __init__(self, distance: Literal["sampson", "symmetric"] = "sampson") -> None:
         check_choice("distance", distance, ("sampson", "symmetric"))

@@ -73,6 +73,12 @@ class TwoViewModel(Residuals):
     sample_size: int  # correspondences in a minimal sample of RANSAC
     preferred: tuple[float, ...]  # the matrix, row by row, that is chosen where the correspondences leave a choice
 
+    # How RANSAC searches
+    confidence = 0.999999  # of the search for a sample without outliers, which must not have much noise either
+    max_batch = 1024  # samples in a batch
+    pool_size = 12  # best hypotheses of a batch, which local optimisation fits, and of all, which the final fit does
+    prescored = 512  # correspondences on which the hypotheses of a batch are scored first, if there are twice as many
+
     # The linear problem
 
     @abstractmethod

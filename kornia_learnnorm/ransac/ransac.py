@@ -24,14 +24,11 @@ from kornia_learnnorm.ransac.final_fit import fit_final
 from kornia_learnnorm.ransac.local_optimization import optimize_locally
 from kornia_learnnorm.ransac.minimal_solver import solve_minimal_samples
 from kornia_learnnorm.ransac.samplers import Sampler, UniformSampler, WeightedSampler
-from kornia_learnnorm.ransac.scoring import MAX_MEDIAN_DISTANCES, PRESCORED, Hypotheses, PairScorer, finite_and_bounded
+from kornia_learnnorm.ransac.scoring import MAX_MEDIAN_DISTANCES, Hypotheses, PairScorer, finite_and_bounded
 from kornia_learnnorm.ransac.threads import one_thread
 
 FIRST_BATCH = 64  # samples in the first batch; each batch is four times as large as the one before
-MAX_BATCH = 1024  # samples in a batch
 MAX_SCORED = 4096  # correspondences that hypotheses are scored on, drawn once
-POOL_SIZE = 12  # best hypotheses of a batch, which local optimisation fits, and of all, which the final fit does
-CONFIDENCE, CALIBRATED_CONFIDENCE = 0.999999, 0.999  # unless another one is asked for
 FEW_INLIERS = 0.25  # of the matches; below, the last tenth of the samples, or a batch, is drawn near the best matrix
 NEAR = 20.0  # thresholds; of the matches this near the best matrix, fewer are outliers than of all
 Cameras = tuple[Tensor, Tensor]
@@ -82,7 +79,8 @@ class RANSAC(nn.Module):
             result depends on the machine.
         confidence: probability, in :math:`(0, 1]`, that sampling does not stop before a sample without outliers, if the
             best matrix so far has found all inliers; 1 draws all ``max_samples`` samples. By default 0.999999, since a
-            sample must not have much noise either, and 0.999 with cameras, which leave noise less room.
+            sample must not have much noise either, 0.9999 for a homography, and 0.999 with cameras, which leave noise
+            less room.
         distance: ``"sampson"``, or ``"symmetric"`` (Fan et al., Eq. 7).
         rank2: how the singularity constraint is enforced on samples of eight: ``"projection"`` in the normaliser's
             coordinates (Hartley's when not given), the default with a ``normalizer``, or ``"optimal"`` correction.
@@ -246,7 +244,7 @@ class RANSAC(nn.Module):
         if weights is not None:
             sampler = WeightedSampler(weights.to(x1), size)
         scored: Tensor | slice = slice(None)
-        if len(x1) >= 2 * PRESCORED:
+        if len(x1) >= 2 * self.model.prescored:
             scored = torch.randperm(len(x1), generator=generator, device=x1.device)[:MAX_SCORED]
         scorer = PairScorer(x1, x2, self.inl_th, self.model, scored)
         scorer = scorer if cameras is None else scorer.of_cameras(*cameras)
@@ -268,7 +266,7 @@ class RANSAC(nn.Module):
 
     def _search(self, scorer: PairScorer, sampler: Sampler, generator: torch.Generator) -> tuple[Hypotheses, int]:
         """Return the best hypotheses that enough minimal samples give, best first, and the number of samples."""
-        pool = Hypotheses(scorer.x1.new_zeros(0, 3, 3), scorer.x1.new_zeros(0))
+        pool, model = Hypotheses(scorer.x1.new_zeros(0, 3, 3), scorer.x1.new_zeros(0)), scorer.model
         most = self.max_samples - (self.max_samples // 10 if self.refine else 0)
         batch, drawn, needed, start, near_best = FIRST_BATCH, 0, most, time.perf_counter(), False
         while drawn < needed:
@@ -278,20 +276,20 @@ class RANSAC(nn.Module):
             if near_best and len(pool.F_mat):
                 source = sampler.among(scorer.distances(pool.F_mat[:1])[0] < NEAR * self.inl_th)
             rows = source.draw(min(batch, needed - drawn), generator)
-            drawn, batch = drawn + len(rows), min(4 * batch, MAX_BATCH)
+            drawn, batch = drawn + len(rows), min(4 * batch, model.max_batch)
             F_mat = solve_minimal_samples(scorer, rows, self.model, self.normalizer)
-            found = scorer.best(scorer.shortlist(F_mat) if self.refine else F_mat, POOL_SIZE)
-            pool = pool.join(found, POOL_SIZE)
+            found = scorer.best(scorer.shortlist(F_mat) if self.refine else F_mat, model.pool_size)
+            pool = pool.join(found, model.pool_size)
             needed = needed if near_best else min(most, self._samples_needed(pool, scorer, sampler))
             # The final fit optimises a pool that ends the search, but of essential matrices its best one alone.
-            fitted_later = drawn >= needed and not isinstance(scorer.model, Essential)
+            fitted_later = drawn >= needed and not isinstance(model, Essential)
             if self.refine and not fitted_later and len(found.F_mat):
-                pool = pool.join(self._optimize(scorer, found.F_mat), POOL_SIZE)
+                pool = pool.join(self._optimize(scorer, found.F_mat), model.pool_size)
                 needed = needed if near_best else min(most, self._samples_needed(pool, scorer, sampler))
             if self.refine and not near_best and drawn >= needed:
                 few = len(pool.F_mat) > 0 and scorer.inliers(pool.F_mat[:1]).to(scorer.x1).mean() < FEW_INLIERS
                 if few or drawn >= most:
-                    near_best, needed = True, min(drawn + max(MAX_BATCH, drawn // 9), self.max_samples)
+                    near_best, needed = True, min(drawn + max(model.max_batch, drawn // 9), self.max_samples)
         return pool, drawn
 
     def _optimize(self, scorer: PairScorer, M: Tensor) -> Hypotheses:
@@ -300,12 +298,11 @@ class RANSAC(nn.Module):
             points1, points2 = (points[None, scorer.rows] for points in scorer.pixels)
             problem = LinearProblem.from_points(points1, points2, scorer.inliers(M[:1]).to(M), self.model)
             M = torch.cat([scorer.from_pixels(solve_linear(problem, self.normalizer)), M])
-        return optimize_locally(scorer, M, POOL_SIZE)
+        return optimize_locally(scorer, M)
 
     def _samples_needed(self, pool: Hypotheses, scorer: PairScorer, sampler: Sampler) -> int:
         """Return how many samples hold one without outliers with the confidence, if the best matrix is right."""
-        usual = CALIBRATED_CONFIDENCE if isinstance(scorer.model, Essential) else CONFIDENCE
-        confidence = usual if self.confidence is None else self.confidence
+        confidence = scorer.model.confidence if self.confidence is None else self.confidence
         if len(pool.F_mat) == 0 or confidence == 1:
             return self.max_samples
         hit_rate = min(sampler.hit_rate(scorer.inliers(pool.F_mat[:1])[0], scorer.rows), 1 - 1e-9)

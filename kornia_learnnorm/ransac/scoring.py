@@ -15,7 +15,6 @@ from kornia_learnnorm.models.two_view_model import TwoViewModel
 MAX_MEDIAN_DISTANCES = 1e6  # largest distance from the median point, in median distances or thresholds
 BLOCK = 1 << 16  # distances computed at once, which stay in a core's cache
 SHORTLIST = 64  # hypotheses that are scored on all correspondences
-PRESCORED = 512  # correspondences on which hypotheses are scored first
 
 
 class Hypotheses(NamedTuple):
@@ -97,10 +96,11 @@ class PairScorer:
         return Hypotheses(F_mat[order[:positive]], score[:positive])
 
     def shortlist(self, F_mat: Tensor) -> Tensor:
-        """Return the 64 matrices that score best on the first 512 correspondences; all if it saves little."""
-        if self.terms.shape[-1] < 2 * PRESCORED or len(F_mat) <= SHORTLIST:
+        """Return the 64 matrices that score best on the first few correspondences; all if it saves little."""
+        first = self.model.prescored
+        if self.terms.shape[-1] < 2 * first or len(F_mat) <= SHORTLIST:
             return F_mat
-        return F_mat[self._scores(F_mat, self.terms[:, :PRESCORED]).topk(SHORTLIST).indices]
+        return F_mat[self._scores(F_mat, self.terms[:, :first]).topk(SHORTLIST).indices]
 
     def inliers(self, F_mat: Tensor) -> Tensor:
         """Return a mask (K, M) of the inliers of matrices (K, 3, 3) among the correspondences that count."""
