@@ -10,9 +10,10 @@ well as the poses are. The last table is of random subsets of the matches of eve
 stderr.
 
     python benchmarks/real_pairs.py DATA [--datasets tum kitti photographs] [--methods DETECTOR+MATCHER ...]
-        [--pairs 50] [--every 4] [--focal FACTOR] [--json FILE] [--csv FILE]
+        [--pairs 50] [--every 4] [--focal FACTOR] [--k1 K1] [--json FILE] [--csv FILE]
 
-With --focal, the focal lengths given to all estimators are wrong by this factor, and nothing runs without cameras.
+With --focal, the focal lengths given to all estimators are wrong by this factor, and nothing runs without cameras; with
+--k1, matches have this radial distortion, OpenCV's k1, that no estimator is told of.
 DATA holds the folders `tum/SEQUENCE`, `kitti/sequences/06`, `kitti/poses/06.txt`, and `images/photographs` with a file
 cameras.json: for each image K and camera_to_world.
 """
@@ -20,6 +21,7 @@ cameras.json: for each image K and camera_to_world.
 import math
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -33,6 +35,7 @@ from torch import Tensor
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.datasets.frames import FramePair
 from kornia_learnnorm.data.datasets.reading import read_dataset
+from kornia_learnnorm.data.images import scaling
 from kornia_learnnorm.evaluation.robust.peers import CALIBRATED, find_peer
 from kornia_learnnorm.evaluation.tables import format_table
 from kornia_learnnorm.metrics.poses import pose_error
@@ -79,6 +82,17 @@ def read_pairs(dataset: str, data: Path) -> list[FramePair]:
     if dataset == PHOTOGRAPHS:
         return photograph_pairs(data / "images" / dataset, GAPS)
     return [FramePair(*pair) for pair in pairwise(read_dataset(dataset, data / dataset, **DATASETS[dataset]))]
+
+
+def distort(matched: MatchedPair, frames: FramePair, k1: float) -> MatchedPair:
+    """Return the matches as a lens with OpenCV's k1 sees them."""
+    moved = []
+    sizes = (matched.full_size1, matched.size1), (matched.full_size2, matched.size2)
+    for frame, points, (full, size) in zip(frames, (matched.points1, matched.points2), sizes, strict=True):
+        K = scaling(full, size) @ torch.from_numpy(frame.K)
+        offset = points - K[:2, 2]
+        moved.append(K[:2, 2] + offset * (1 + k1 * (offset / K.diagonal()[:2]).square().sum(-1, keepdim=True)))
+    return replace(matched, points1=moved[0], points2=moved[1])
 
 
 def error_of_pose(pair: Pair, F_mat: Tensor, points1: Tensor, points2: Tensor) -> float:
@@ -262,6 +276,7 @@ def main(args: Sequence[str] | None = None) -> None:
     parser.add_argument("--pairs", type=int, default=50, help="first pairs of each set")
     parser.add_argument("--every", type=int, default=4, help="subsets are drawn of each so many-th pair; 0 for none")
     parser.add_argument("--focal", type=float, default=1.0, help="factor of the focal lengths given")
+    parser.add_argument("--k1", type=float, default=0.0, help="radial distortion of the matches")
     options = parser.parse_args(args)
     peers = {name: {} for name in PEERS}
     for name in PEERS:
@@ -275,8 +290,9 @@ def main(args: Sequence[str] | None = None) -> None:
         for number, frames in enumerate(read_pairs(dataset, options.data)[: options.pairs]):
             detector, matcher = method.split("+")
             matched = match_two_images(*(frame.path for frame in frames), detector=detector, matcher=matcher)
+            matched = distort(matched, frames, options.k1)
             sizes = SIZES if options.every and number % options.every == 0 else ()
-            for calibrated in (False, True) if options.focal == 1 else (True,):
+            for calibrated in (False, True) if (options.focal, options.k1) == (1, 0) else (True,):
                 solvers = {name: solver[calibrated] for name, solver in peers.items()}
                 pair = Pair(dataset, number, frames, calibrated, method, matched, options.focal)
                 records += measure(pair, solvers, sizes)

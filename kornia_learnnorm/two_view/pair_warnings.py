@@ -7,16 +7,10 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.data.images import Size
-from kornia_learnnorm.estimators.refinement import refine_essential, refine_fundamental
-from kornia_learnnorm.estimators.robust_losses import GemanMcClure
-from kornia_learnnorm.geometry.distances import sampson_distance
-from kornia_learnnorm.geometry.pose import relative_pose
-from kornia_learnnorm.metrics.poses import pose_error
 from kornia_learnnorm.models.fundamental import Fundamental
-from kornia_learnnorm.ransac.final_fit import LOSS_SCALE
 from kornia_learnnorm.ransac.minimal_solver import spread_across
+from kornia_learnnorm.two_view.camera_misfit import camera_misfit, lens_misfit
 from kornia_learnnorm.two_view.inputs import Cameras
-from kornia_learnnorm.two_view.predicted_error import MEDIAN_SQUARE, MIN_NOISE
 
 MAX_ANGLE = 8.0  # degrees; a pose that moves by more in half of the parts is unstable
 MIN_INLIERS = 16  # with fewer, no estimate of the error is reliable either
@@ -121,44 +115,20 @@ def find_camera_doubt(
             return (PairWarning("cameras", f"{text}: {name} may be that of another image size"),)
     if F_mat is None:
         return ()
-    misfit, log_chance, angle = camera_misfit(points1, points2, F_mat, threshold, cameras)
-    if misfit < MIN_MISFIT * float(points2.max()) or log_chance > MAX_LOG_CHANCE_MISFIT or angle < MIN_POSE_CHANGE:
+    about, least = (points1, points2, F_mat, threshold, cameras), MIN_MISFIT * float(points2.max())
+    lens, k1 = lens_misfit(*about)
+    found = [(camera_misfit(*about), "without them"), (lens, f"with a lens distortion of about k1 = {k1:.2g}")]
+    found = [
+        (misfit, text)
+        for misfit, text in found
+        if misfit.distance >= least and misfit.log_chance <= MAX_LOG_CHANCE_MISFIT and misfit.angle >= MIN_POSE_CHANGE
+    ]
+    if not found:
         return ()
-    return (PairWarning("cameras", f"{CONTRADICTION}: without them the pose differs by {angle:.0f} degrees"),)
+    misfit, text = max(found)
+    return (PairWarning("cameras", f"{CONTRADICTION}: {text} the pose differs by {misfit.angle:.0f} degrees"),)
 
 
 def drop_contradiction(warnings: tuple[PairWarning, ...]) -> tuple[PairWarning, ...]:
     """Return the warnings without that of matches that contradict their cameras."""
     return tuple(warning for warning in warnings if not warning.text.startswith(CONTRADICTION))
-
-
-def camera_misfit(
-    points1: Tensor, points2: Tensor, F_mat: Tensor, threshold: float, cameras: Cameras
-) -> tuple[float, float, float]:
-    """Return the root mean square distance that cameras add to matches (N, 2), pixels, and log10 of its probability.
-
-    The third number is the angle by which they change rotation or translation, degrees.
-
-    Compared are the essential matrix next to F_mat (3, 3) and the fundamental matrix next to it. Only matches that
-    agree with the cameras count, and the median distance must grow as much as the mean: false matches may agree on
-    another matrix. Noise alone makes the likelihood ratio of both matrices twice an F-distributed number of 2, for as
-    many more parameters, and :math:`m` degrees of freedom: it is above :math:`2x` with probability
-    :math:`(1 + 2x / m)^{-m / 2}`.
-    """
-    x1, x2, loss = points1[None], points2[None], GemanMcClure(LOSS_SCALE * threshold)
-    E_mat = (cameras[1].mT @ F_mat @ cameras[0])[None]
-    near = sampson_distance(x1, x2, refine_essential(x1, x2, E_mat, *cameras, loss=loss).F_mat)[0] < threshold
-    freedom = int(near.sum()) - Fundamental.dof
-    if freedom < 2:
-        return 0.0, 0.0, 0.0
-    x1, x2 = x1[:, near], x2[:, near]
-    tied = refine_essential(x1, x2, E_mat, *cameras, loss=loss)
-    free = refine_fundamental(x1, x2, tied.F_mat, loss=loss)
-    median1, median2 = (float(sampson_distance(x1, x2, F)[0].square().median()) for F in (tied.F_mat, free.F_mat))
-    added = max(0.0, float(tied.cost - free.cost)) / freedom
-    noise = max(median2 / MEDIAN_SQUARE, (MIN_NOISE * threshold) ** 2)
-    misfit = min(added, max(0.0, median1 - median2) / MEDIAN_SQUARE)
-    K1, K2 = (K[None] for K in cameras)
-    poses = [relative_pose(F_mat, K1, K2, x1, x2) for F_mat in (free.F_mat, tied.F_mat)]
-    angle = pose_error(*poses[0], *poses[1]).nan_to_num(nan=180.0, posinf=180.0).item()
-    return math.sqrt(misfit), -freedom / 2 * math.log10(1 + added / noise), angle

@@ -15,6 +15,7 @@ from kornia_learnnorm.data.synthetic import handheld
 from kornia_learnnorm.data.synthetic.random_matches import random_planes
 from kornia_learnnorm.metrics.poses import pose_error
 from kornia_learnnorm.two_view import pair_warnings, predicted_error
+from kornia_learnnorm.two_view.camera_misfit import camera_misfit, lens_misfit
 from kornia_learnnorm.two_view.pair_warnings import drop_contradiction, find_warnings, log_false_alarms
 from kornia_learnnorm.two_view.solver import TwoViewSolver
 
@@ -179,7 +180,7 @@ class TestCameraMisfit:
         tied = kln.refine_essential(*points, E_mat, *cameras).F_mat
         free = kln.refine_fundamental(*points, F_MAT[None]).F_mat
         more, less = (kln.sampson_distance(*points, F_mat)[0].square() for F_mat in (tied, free))
-        found, log_chance, angle = pair_warnings.camera_misfit(*POINTS, F_MAT, 30.0, cameras)  # so that all count alike
+        found, log_chance, angle = camera_misfit(*POINTS, F_MAT, 30.0, cameras)  # so that all count alike
         medians = (more.median() - less.median()).item() / 0.455
         assert found == pytest.approx(min((more - less).mean().item(), medians) ** 0.5, rel=0.05)
         assert log_chance < -20
@@ -187,7 +188,7 @@ class TestCameraMisfit:
         assert angle == pytest.approx(pose_error(*poses[0], *poses[1]).item(), abs=0.2)
 
     def test_grows_with_the_error_of_the_focal_length(self):
-        found = [pair_warnings.camera_misfit(*POINTS, F_MAT, 1.0, (with_focal(f),) * 2) for f in (1.0, 1.1, 1.2, 1.4)]
+        found = [camera_misfit(*POINTS, F_MAT, 1.0, (with_focal(f),) * 2) for f in (1.0, 1.1, 1.2, 1.4)]
         assert found == sorted(found, key=lambda triple: (triple[0], -triple[1], triple[2]))
         assert found[0][1] > -3
 
@@ -195,17 +196,37 @@ class TestCameraMisfit:
         """A third as many, of another motion."""
         other = handheld(1, 100, seeded(5), noise=0.3)
         points = (torch.cat([x, y[0]]) for x, y in zip(POINTS, (other.points1, other.points2), strict=True))
-        assert pair_warnings.camera_misfit(*points, F_MAT, 1.0, (K, K))[0] < 0.03
+        assert camera_misfit(*points, F_MAT, 1.0, (K, K))[0] < 0.03
 
     def test_few_matches_tell_nothing(self):
         options = F_MAT, 1.0, (with_focal(1.4),) * 2
-        assert pair_warnings.camera_misfit(*(x[:12] for x in POINTS), *options)[1] > -3
-        assert pair_warnings.camera_misfit(*(x[:8] for x in POINTS), *options) == (0.0, 0.0, 0.0)
+        assert camera_misfit(*(x[:12] for x in POINTS), *options)[1] > -3
+        assert camera_misfit(*(x[:8] for x in POINTS), *options) == (0.0, 0.0, 0.0)
 
     @given(scale=st.floats(0.2, 5))
     def test_has_the_unit_of_the_points(self, scale):
         S = torch.diag(torch.tensor([scale, scale, 1.0], dtype=torch.float64))
         F_mat = torch.linalg.inv(S) @ F_MAT @ torch.linalg.inv(S)
-        found = pair_warnings.camera_misfit(*(scale * x for x in POINTS), F_mat, scale, (S @ with_focal(1.3),) * 2)
-        misfit, *others = pair_warnings.camera_misfit(*POINTS, F_MAT, 1.0, (with_focal(1.3),) * 2)
+        found = camera_misfit(*(scale * x for x in POINTS), F_mat, scale, (S @ with_focal(1.3),) * 2)
+        misfit, *others = camera_misfit(*POINTS, F_MAT, 1.0, (with_focal(1.3),) * 2)
         assert found == pytest.approx((scale * misfit, *others), rel=1e-3)
+
+
+class TestLensMisfit:
+    @pytest.mark.parametrize("k1", [-0.25, 0.2])
+    def test_against_opencv_and_the_true_pose(self, k1):
+        cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
+        rays = [(torch.nn.functional.pad(x, (0, 1), value=1.0) @ torch.linalg.inv(K).mT).numpy() for x in POINTS]
+        bent = [cv2.projectPoints(x, *np.zeros((2, 3)), K.numpy(), np.array([k1, 0, 0, 0]))[0] for x in rays]
+        points1, points2 = (torch.from_numpy(x[:, 0]) for x in bent)
+        found = kln.estimate_matches(points1, points2, size1=CAMERA_SIZE, size2=CAMERA_SIZE, K1=K, K2=K)
+        misfit, estimate = lens_misfit(points1, points2, found.F_mat, 1.0, (K, K))
+        assert estimate == pytest.approx(k1, abs=0.04)
+        error = pose_error(found.R, found.t, SCENE.R[0], SCENE.t[0]).item()
+        assert misfit.angle == pytest.approx(error, abs=1)
+        assert f"about k1 = {estimate:.2g} the pose differs by" in found.warnings[0].text
+
+    def test_a_pinhole_has_none(self):
+        misfit, k1 = lens_misfit(*POINTS, F_MAT, 1.0, (K, K))
+        assert (misfit.distance, k1) == pytest.approx((0, 0), abs=0.02)
+        assert lens_misfit(*(x[:7] for x in POINTS), F_MAT, 1.0, (K, K)) == ((0.0, 0.0, 0.0), 0.0)
