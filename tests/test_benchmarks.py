@@ -137,10 +137,6 @@ def test_every_method_is_timed(backward, monkeypatch):
     times = speed.measure(methods, speed.Case(2, 12), args, backward)
     assert times.keys() == methods.keys()
     assert min(times.values()) > 0
-    lines = speed.table({"2 x 12": times, "4 x 12": {speed.KORNIA: 2.0, "Hartley": 3.0}}).splitlines()
-    assert len(lines) == len(methods) + 2
-    assert "3 (1.50)" in next(line for line in lines if "Hartley" in line)
-    assert lines[-1].rstrip("| ").endswith("-")
 
 
 def test_poses_of_a_store(tmp_path, capsys):
@@ -155,7 +151,7 @@ def test_poses_of_a_store(tmp_path, capsys):
     assert "| RANSAC-calibrated" in capsys.readouterr().out
 
 
-def test_planes(tmp_path, capsys):
+def test_planes(tmp_path):
     file = tmp_path / "planes.csv"
     planes.main(["--sizes", "64", "--outliers", "0.2", "--sets", "3", "--csv", str(file)])
     header, *rows = read_csv(file)
@@ -163,7 +159,6 @@ def test_planes(tmp_path, capsys):
     errors = {row[2]: float(row[3]) for row in rows}
     assert max(errors[name] for name in ("RANSAC", "opencv-usac-magsac", "learned:robust-homography")) < 20
     assert errors["kornia-dlt"] > 20
-    assert "20% outliers" in capsys.readouterr().out
     assert planes.corner_error(None, torch.eye(3).double(), torch.zeros(4, 2).double()) == planes.MAX_ERROR
 
 

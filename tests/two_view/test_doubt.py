@@ -187,11 +187,6 @@ class TestCameraMisfit:
         poses = [kln.relative_pose(F_mat, *(K[None] for K in cameras), *points) for F_mat in (tied, free)]
         assert angle == pytest.approx(pose_error(*poses[0], *poses[1]).item(), abs=0.2)
 
-    def test_grows_with_the_error_of_the_focal_length(self):
-        found = [camera_misfit(*POINTS, F_MAT, 1.0, (with_focal(f),) * 2) for f in (1.0, 1.1, 1.2, 1.4)]
-        assert found == sorted(found, key=lambda triple: (triple[0], -triple[1], triple[2]))
-        assert found[0][1] > -3
-
     def test_false_matches_that_agree_do_not_count(self):
         """A third as many, of another motion."""
         other = handheld(1, 100, seeded(5), noise=0.3)
@@ -212,21 +207,16 @@ class TestCameraMisfit:
         assert found == pytest.approx((scale * misfit, *others), rel=1e-3)
 
 
-class TestLensMisfit:
-    @pytest.mark.parametrize("k1", [-0.25, 0.2])
-    def test_against_opencv_and_the_true_pose(self, k1):
-        cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
-        rays = [(torch.nn.functional.pad(x, (0, 1), value=1.0) @ torch.linalg.inv(K).mT).numpy() for x in POINTS]
-        bent = [cv2.projectPoints(x, *np.zeros((2, 3)), K.numpy(), np.array([k1, 0, 0, 0]))[0] for x in rays]
-        points1, points2 = (torch.from_numpy(x[:, 0]) for x in bent)
-        found = kln.estimate_matches(points1, points2, size1=CAMERA_SIZE, size2=CAMERA_SIZE, K1=K, K2=K)
-        misfit, estimate = lens_misfit(points1, points2, found.F_mat, 1.0, (K, K))
-        assert estimate == pytest.approx(k1, abs=0.04)
-        error = pose_error(found.R, found.t, SCENE.R[0], SCENE.t[0]).item()
-        assert misfit.angle == pytest.approx(error, abs=1)
-        assert f"about k1 = {estimate:.2g} the pose differs by" in found.warnings[0].text
-
-    def test_a_pinhole_has_none(self):
-        misfit, k1 = lens_misfit(*POINTS, F_MAT, 1.0, (K, K))
-        assert (misfit.distance, k1) == pytest.approx((0, 0), abs=0.02)
-        assert lens_misfit(*(x[:7] for x in POINTS), F_MAT, 1.0, (K, K)) == ((0.0, 0.0, 0.0), 0.0)
+@pytest.mark.parametrize("k1", [-0.25, 0.0, 0.2])
+def test_lens_misfit(k1):
+    """By the distortion of OpenCV, and the error of the pose."""
+    cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
+    rays = [(torch.nn.functional.pad(x, (0, 1), value=1.0) @ torch.linalg.inv(K).mT).numpy() for x in POINTS]
+    bent = [cv2.projectPoints(x, *np.zeros((2, 3)), K.numpy(), np.array([k1, 0, 0, 0]))[0][:, 0] for x in rays]
+    found = kln.estimate_matches(*bent, size1=CAMERA_SIZE, size2=CAMERA_SIZE, K1=K, K2=K)
+    misfit, estimate = lens_misfit(*map(torch.from_numpy, bent), found.F_mat, 1.0, (K, K))
+    assert estimate == pytest.approx(k1, abs=0.04)
+    assert misfit.angle == pytest.approx(pose_error(found.R, found.t, SCENE.R[0], SCENE.t[0]).item(), abs=2)
+    text = f"the matches contradict K1 and K2: with a lens distortion of about k1 = {estimate:.2g} the pose differs by"
+    assert [warning.text.startswith(text) for warning in found.warnings] == [True] * (k1 != 0)
+    assert lens_misfit(*(x[:7] for x in POINTS), F_MAT, 1.0, (K, K)) == ((0.0, 0.0, 0.0), 0.0)

@@ -36,7 +36,6 @@ def test_the_papers_data():
         ("TUM RGB-D freiburg3_long_office_household, frames about 1 s apart, resized to 1226x370", "TUM"),
         ("TUM RGB-D freiburg3_long_office_household, frames about 1 s apart", ""),
         ("TUM RGB-D freiburg1_desk, resized to 1226x370", ""),
-        ("images of kitti_06", ""),
     ]:
         assert papers_data(f"{description}, 51 pairs, 1000 matches") == name
 
@@ -138,10 +137,8 @@ def test_the_smallest_error_wins_and_what_is_level_is_named():
             ["`best` has", "median 3.250 px; Hartley has 6.500 px", "-50.0 % [-50.0, -50.0]", "Level with it: `close`"],
         ),
         ({"bad": 3.0, "mine": 1.5}, ["`Hartley` has", "`mine` with 9.750 px", "+50.0 % [+50.0, +50.0]"]),
-        ({"close": 1.005 * NOISE}, ["Level with it: `close`"]),
         # The median decides, and a smaller geometric mean is named.
         ({"Hartley": 4.0, "exact": FEW, "steady": 1.0}, ["`steady` has", "median 6.500 px", "smaller for `exact`"]),
-        ({}, ["nothing to test it against"]),
     ]:
         text = summary_of(scales)
         assert "**a, filtered** (60 samples of 12 image pairs)" in text
@@ -152,7 +149,6 @@ def test_the_smallest_error_wins_and_what_is_level_is_named():
 def test_few_pairs_are_not_tested(pairs, scale):
     text = summary_of({"mine": scale}, torch.arange(SAMPLES) % pairs)
     assert ("change of the geometric mean" in text) == (pairs == 8)
-    assert ("a test needs 8" in text) == (pairs < 8)
 
 
 @pytest.mark.parametrize(
