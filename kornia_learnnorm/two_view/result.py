@@ -77,6 +77,10 @@ class PairEstimate:
     other_pose: PlanePose | None = None  # second pose and normal that the plane allows; None where there is one alone
     rows: Tensor | None = None  # place of each match among those given to estimate_matches, (N,); None of two images
 
+    def __str__(self) -> str:
+        """Return :meth:`summary`."""
+        return self.summary()
+
     @property
     def model(self) -> str:
         """Name of the answer: ``fundamental`` or ``homography``."""
