@@ -19,9 +19,10 @@ from kornia_learnnorm.two_view.inputs import Cameras
 from kornia_learnnorm.two_view.predicted_error import MEDIAN_SQUARE, MIN_NOISE
 
 NEAR_BENT, MAX_BENT = 3.0, 1000  # thresholds, and number; matches this near a matrix tell of a distortion
-# Shares by which undistortion moves the outermost point that are tried, and around the best of them.
-BENDS, FINER = torch.arange(-2, 7, dtype=torch.float64) / 10, torch.arange(-3, 4, dtype=torch.float64) / 40
-PINHOLE = 2  # of BENDS, none
+# Shares by which undistortion moves the outermost point that are tried, and around the best of them: from strong
+# pincushion distortion to that of a wide angle.
+BENDS, FINER = torch.arange(-1, 7, dtype=torch.float64) / 10, torch.arange(-3, 4, dtype=torch.float64) / 40
+PINHOLE = 1  # of BENDS, none
 
 
 class Misfit(NamedTuple):
@@ -63,7 +64,8 @@ def lens_misfit(
     r"""Return what pinhole cameras cost matches (N, 2), compared with a radial distortion, and its k1 in OpenCV.
 
     A point at the radius :math:`r` from the principal point, in focal lengths, is that of a pinhole camera at
-    :math:`r (1 + k r^2)`. Of some :math:`k`, the same for both views, that of the least cost counts.
+    :math:`r (1 + k r^2)`. Of some :math:`k`, the same for both views, that of the least cost counts, unless it is the
+    largest or the smallest.
     """
     near = (sampson_distance(points1[None], points2[None], F_mat[None])[0] < NEAR_BENT * threshold).nonzero()[:, 0]
     near = near[:: 1 + len(near) // MAX_BENT]
@@ -89,8 +91,9 @@ def lens_misfit(
     fine = refine(bends)
     best = min(range(len(bends)), key=lambda row: fine[row].cost)
     # A point that undistortion moves from r to r (1 + b) goes back by the factor 1 + k1 r^2 (1 + b)^2.
-    bend = float(bends[best])
-    tied = coarse[PINHOLE]
+    bend, tied = float(bends[best]), coarse[PINHOLE]
+    if not BENDS[0] < bend < BENDS[-1]:  # what no lens explains better
+        return Misfit(0.0, 0.0, 0.0), 0.0
     misfit = _compare(tied, fine[best], freedom, threshold, cameras)
     misfit = misfit._replace(angle=_pose_angle(tied._replace(F_mat=F_mat[None]), fine[best], cameras))
     return misfit, -bend / (largest * (1 + bend) ** 3)
