@@ -170,7 +170,8 @@ def inlier_probability(
     M = torch.where(swapped, model.swap(M), M)
     x1, x2 = torch.where(swapped, x2, x1), torch.where(swapped, x1, x2)
     squares = model.squares(model.residual(M / torch.linalg.matrix_norm(M, keepdim=True), x1, x2))
-    mean = weighted_mean((squares + SQUARE_FLOOR)[..., None].log(), prior.sigmoid() * present).exp()
+    weights = present if problem.weights is None else problem.weights
+    mean = weighted_mean((squares + SQUARE_FLOOR)[..., None].log(), prior.sigmoid() * weights).exp()
     variance = mean * VARIANCE[model.components]
     evidence = model.components * (LOG_RANGE - variance.log() / 2) - squares / (2 * variance)
     enough = determined & (present.sum(1) >= MIN_JUDGED)

@@ -37,7 +37,7 @@ EARLY_SCALE, LAST_SCALE = 3.0, 0.7
 # In evaluation, the means are those of near distances, up to about three means. Networks would learn slower by them.
 NEAR, EARLY_NEAR_SCALE, LAST_NEAR_SCALE, SETTLED_SCALE = 3.0, 4.2, 1.0, 4.4
 SCALE_BOUND = 1.5  # the logarithm of the factor stays within plus and minus this
-LAST_POWER = 0.1  # of the weights in the last stage: most matches are to count, and a robust loss drops outliers
+LAST_POWER = 0.1  # of the probabilities in the last stage: most matches are to count, and a robust loss drops outliers
 RELAXATION = 1.3  # of a step: the curvature of a robust loss is less than its weights
 MAX_RAY = 1e3  # of the features; far larger ones would overflow in the networks
 EARLY_PIXELS, LAST_PIXELS = 2.0, 0.7  # scales of the losses that candidates are compared by
@@ -69,7 +69,7 @@ def run_pose_stages(
     states: list[Calibrated] = []
     found: list[Tensor] = []
     settled = torch.zeros_like(problem.x1[:, 0, 0], dtype=torch.bool)
-    dtype, tiny = networks[0].stem.weight.dtype, torch.finfo(problem.x1.dtype).tiny
+    dtype = networks[0].stem.weight.dtype
     near, early, last = (NEAR, EARLY_NEAR_SCALE, LAST_NEAR_SCALE) if settle else (None, EARLY_SCALE, LAST_SCALE)
     for network in networks:
         seen, factor, before = features, None, None
@@ -91,8 +91,10 @@ def run_pose_stages(
             settled = few_outliers(logits, None if problem.weights is None else problem.weights > 0)
         weights = logits.sigmoid()
         weights = weights / weights.detach().amax(1, keepdim=True) + MIN_WEIGHT
+        power = weights**LAST_POWER
         if problem.weights is not None:  # their ratios matter, not how many matches they seem to make
-            weights = weights * (problem.weights / safe_divisor(problem.weights.detach().amax(1, keepdim=True)))
+            given = problem.weights / safe_divisor(problem.weights.detach().amax(1, keepdim=True))
+            weights, power = weights * given, power * given
         suggested = weights if factor is None else weights * factor
         found.append(logits)
         if len(found) == len(networks) or (is_known_true(settled.all()) and len(settled) > 0):
@@ -110,7 +112,7 @@ def run_pose_stages(
         state, front = _most_consistent(evidence, model, unit, weights, suggested, before, drawn, settled)
         state, front = _search_near(evidence, model, unit, weights, state, front, drawn, settled)
     state = model.attach(state)
-    share = torch.where(front & (weights > 0), weights.clamp(min=tiny) ** LAST_POWER, 0.0)
+    share = torch.where(front, power, 0.0)
     scale = torch.where(settled[:, None], SETTLED_SCALE, last * scale)
     options = _square_scale(weights, scale, unit, near), layer.refine_steps, RELAXATION
     state = descend(evidence, state, share[:, None], *options)

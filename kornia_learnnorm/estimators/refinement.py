@@ -74,7 +74,8 @@ def refine_fundamental(
         loss: :math:`\rho` of squared distances: :func:`~kornia_learnnorm.estimators.robust_losses.squared_loss`,
             :class:`~kornia_learnnorm.Huber`, :class:`~kornia_learnnorm.Cauchy`,
             :class:`~kornia_learnnorm.GemanMcClure` or :class:`~kornia_learnnorm.Truncated`.
-        max_iterations: largest number of steps tried.
+        max_iterations: largest number of steps tried. :class:`~kornia_learnnorm.Huber` often takes more than 50 among
+            outliers, and then sends no gradient.
         tolerance: largest cosine between the distances and their derivatives at which a matrix has converged. 1e-3
             saves half of the steps and more, and leaves the cost within about 0.2 % of the optimum: enough for an
             estimate, not for its gradient.

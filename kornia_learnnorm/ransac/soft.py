@@ -59,9 +59,9 @@ def sample_minimal_sets(logits: Tensor, count: int, generator: Generator | None 
     arrivals = torch.empty_like(log_p).exponential_(generator=generator).log() - log_p.detach()
     samples = arrivals.topk(8, largest=False).indices
     chosen = log_p.gather(-1, samples)
-    drawn = chosen.exp().cumsum(-1)[..., :-1]
-    left = (1 - drawn).clamp(min=torch.finfo(drawn.dtype).eps)
-    return samples, (chosen.sum(-1) - left.log().sum(-1)).to(logits.dtype)
+    never = log_p.scatter(-1, samples, -torch.inf).logsumexp(-1, keepdim=True)
+    left = torch.cat([never, chosen.flip(-1)], -1).logcumsumexp(-1)[..., 1:]  # probabilities of those left, last first
+    return samples, (chosen - left.flip(-1)).sum(-1).to(logits.dtype)
 
 
 class SoftChoice(NamedTuple):
