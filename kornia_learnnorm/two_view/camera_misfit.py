@@ -73,6 +73,7 @@ def lens_misfit(
     if freedom < 2:
         return Misfit(0.0, 0.0, 0.0), 0.0
     views, loss = (points1[near], points2[near]), GemanMcClure(LOSS_SCALE * threshold)
+    cameras = cameras[0] / cameras[0][2, 2], cameras[1] / cameras[1][2, 2]
     rays = [convert_points_to_homogeneous(x) @ torch.linalg.inv(K).mT for x, K in zip(views, cameras, strict=True)]
     squares = [ray[:, :2].square().sum(-1, keepdim=True) for ray in rays]
     largest = float(torch.cat(squares).max())

@@ -214,7 +214,7 @@ def test_lens_misfit(k1):
     rays = [(torch.nn.functional.pad(x, (0, 1), value=1.0) @ torch.linalg.inv(K).mT).numpy() for x in POINTS]
     bent = [cv2.projectPoints(x, *np.zeros((2, 3)), K.numpy(), np.array([k1, 0, 0, 0]))[0][:, 0] for x in rays]
     found = kln.estimate_matches(*bent, size1=CAMERA_SIZE, size2=CAMERA_SIZE, K1=K, K2=K)
-    misfit, estimate = lens_misfit(*map(torch.from_numpy, bent), found.F_mat, 1.0, (K, K))
+    misfit, estimate = lens_misfit(*map(torch.from_numpy, bent), found.F_mat, 1.0, (2 * K, K))
     assert estimate == pytest.approx(k1, abs=0.04)
     assert misfit.angle == pytest.approx(pose_error(found.R, found.t, SCENE.R[0], SCENE.t[0]).item(), abs=2)
     text = f"the matches contradict K1 and K2: with a lens distortion of about k1 = {estimate:.2g} the pose differs by"
