@@ -18,7 +18,7 @@ from kornia_learnnorm.protocol import INLIER_THRESHOLD
 from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.ransac.scoring import finite_and_bounded
 from kornia_learnnorm.two_view import predicted_error
-from kornia_learnnorm.two_view.inputs import Points, check_settings, read_cameras, read_matches, read_size
+from kornia_learnnorm.two_view.inputs import Cameras, Points, check_settings, read_cameras, read_matches, read_size
 from kornia_learnnorm.two_view.model_choice import choose_model
 from kornia_learnnorm.two_view.pair_warnings import (
     CONTRADICTION,
@@ -29,7 +29,7 @@ from kornia_learnnorm.two_view.pair_warnings import (
     log_false_alarms,
 )
 from kornia_learnnorm.two_view.parallax import MAX_LOG_CHANCE_PARALLAX, OFF_PLANE
-from kornia_learnnorm.two_view.plane_pose import angle_between, plane_poses
+from kornia_learnnorm.two_view.plane_pose import PlanePose, angle_between, plane_poses
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.two_view.solver import MIN_MATCHES, Solution, TwoViewSolver
 
@@ -109,6 +109,8 @@ def estimate_matches(
         else:
             fields, error, doubts = _answer_fundamental(solver, cast(Solution, found), size1, size2)
         relief = choice.model == "fundamental" and choice.parallax is not None and not choice.parallax.planar
+        if cameras is not None and choice.model == "fundamental" and not relief and H_mat is not None:
+            doubts += _find_plane_pose(solver, H_mat, fields)
         if cameras is not None:  # a plane contradicts no cameras, but wrong cameras can make a scene look like a plane
             doubt = find_camera_doubt(cameras, given, points1, points2, F_mat if relief else None, threshold)
             doubts += doubt or _compare_free(solver, fields, free)
@@ -201,6 +203,25 @@ def _find_rival(
         return ()
     text = f"{agree} matches agree on this matrix, {support} others on one whose pose differs by {angle:.0f} degrees"
     return (PairWarning("ambiguous", text),)
+
+
+def _find_plane_pose(solver: TwoViewSolver, H_mat: Tensor, fields: dict[str, Any]) -> tuple[PairWarning, ...]:
+    """Return a warning where a plane has another pose that matches agree with about as well as with that of E."""
+    cameras, inliers = cast(Cameras, solver.cameras), fields["inliers"]
+    near = solver.distance(H_mat, "homography") < OFF_PLANE * solver.threshold
+    if "R" not in fields or not bool(near.any()):
+        return ()
+    own = PlanePose(fields["R"], fields["t"])
+    for pose in plane_poses(H_mat, *cameras, solver.points1[near], solver.points2[near]):
+        angle = angle_between(own, [pose])
+        if pose.t is None or angle < MIN_RIVAL_ANGLE:
+            continue
+        others = solver.distance(solver.refine(pose.fundamental(*cameras))) < solver.threshold
+        first, second = int((inliers & ~others).sum()), int((others & ~inliers).sum())
+        if first - second <= MIN_DEVIATIONS * math.sqrt(first + second):
+            text = f"the plane has a second pose, {angle:.0f} degrees away: too few matches off it decide"
+            return (PairWarning("ambiguous", text),)
+    return ()
 
 
 def _answer_homography(solver: TwoViewSolver, H_mat: Tensor, F_mat: Tensor | None) -> Answer:

@@ -108,7 +108,7 @@ class TwoViewSolver:
         if self.cameras is None:
             F_mat = self._try_plane_and_parallax(F_mat)
         elif self.layer is not None:
-            F_mat = self._refine(F_mat)
+            F_mat = self.refine(F_mat)
         return Solution(F_mat, weights, F_mat.new_zeros(0, 3, 3), 0)
 
     def rival(self, inliers: Tensor) -> tuple[Tensor, int] | None:
@@ -138,10 +138,20 @@ class TwoViewSolver:
         least = MIN_SCORE_GAIN * self._score(F_mat)
         if float(best.score.sum()) <= least:
             return F_mat
-        other = self._refine(self.scorer.to_pixels(best.F_mat)[0])
+        other = self.refine(self.scorer.to_pixels(best.F_mat)[0])
         if self.layer is None:
             other = self._search_near(other)
         return other if self._score(other) > least else F_mat
+
+    def refine(self, F_mat: Tensor) -> Tensor:
+        """Return the matrix refined on the robust loss with which RANSAC ends, of known cameras if there are."""
+        if self.cameras is None:
+            return self._refine_at(LOSS_SCALE * self.threshold, F_mat)
+        start = self.scorer.best(self.scorer.from_pixels(F_mat[None]), 1)
+        if len(start.F_mat) == 0:
+            return F_mat
+        scorer = self.scorer.of_cameras(*self.cameras)
+        return unit_matrix(scorer.to_pixels(fit_final(scorer, start).matrix()))[0]
 
     def distance(self, M: Tensor, model: Model = "fundamental") -> Tensor:
         """Return the distances (*, N) of the matches to matrices (*, 3, 3), pixels: epipolar, or from H x1 to x2."""
@@ -198,16 +208,6 @@ class TwoViewSolver:
                 break
             F_mat = other
         return F_mat
-
-    def _refine(self, F_mat: Tensor) -> Tensor:
-        """Return the matrix refined on the robust loss with which RANSAC ends, of known cameras if there are."""
-        if self.cameras is None:
-            return self._refine_at(LOSS_SCALE * self.threshold, F_mat)
-        start = self.scorer.best(self.scorer.from_pixels(F_mat[None]), 1)
-        if len(start.F_mat) == 0:
-            return F_mat
-        scorer = self.scorer.of_cameras(*self.cameras)
-        return unit_matrix(scorer.to_pixels(fit_final(scorer, start).matrix()))[0]
 
     def _refine_at(self, scale: float, F_mat: Tensor) -> Tensor:
         loss = GemanMcClure(scale)

@@ -72,7 +72,6 @@ class TestEstimateMatches:
         moved = np.c_[exact1, np.ones(150)] @ found.matrix.numpy().T
         error = np.median(np.linalg.norm(moved[:, :2] / moved[:, 2:] - exact2, axis=1))
         assert 0.2 < found.predicted_error / error < 5
-        assert found.F_mat is not None
         assert "\nmodel    homography: one homography explains" in found.summary()
         content = json.loads(json.dumps(found.as_dict(), allow_nan=False))
         assert (content["model"], content["H"]) == ("homography", found.H_mat.tolist())
@@ -87,7 +86,6 @@ class TestEstimateMatches:
         assert found.n[2] > np.cos(np.radians(2))
         assert found.front[found.inliers].all()
         assert np.median(epipolar_distances(*see_plane(R, t, noise=0.0), found.F_mat)) < 0.5
-        assert "\nn (normal of the plane in camera 1)\n" in found.summary()
 
     def test_two_poses_of_a_plane(self):
         """Of a camera that moves forwards: matches off the plane agree with the true one alone."""
@@ -99,6 +97,8 @@ class TestEstimateMatches:
         assert found.other_pose.t.numpy() @ t / np.linalg.norm(t) < np.cos(np.radians(6))
         assert {*found.as_dict()["other_pose"]} == {"R", "t", "n"}
         assert (codes(found), codes(alone)) == (["relief"], ["ambiguous"])
+        noisy = kln.estimate_matches(*see_plane(R, t, noise=1.5), **SIZES, K1=K, K2=K)
+        assert (noisy.model, codes(noisy)) == ("fundamental", ["ambiguous"])
 
     def test_a_camera_that_turns(self):
         R = cv2.Rodrigues(np.array([0.02, -0.1, 0.01]))[0]
