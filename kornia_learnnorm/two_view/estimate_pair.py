@@ -127,7 +127,8 @@ class MatchedPair:
             false = self.points1[~self.mutual], self.points2[~self.mutual]
             matches = first.points1, first.points2, first.scores
             found = resolve_ambiguity(first, *false, lambda kept: solve("fundamental", *(x[kept] for x in matches)))
-            found = replace(found, choice=first.choice, H_mat=first.H_mat)
+            choice = first.choice._replace(fundamental_inliers=found.num_inliers)
+            found = replace(found, choice=choice, H_mat=first.H_mat)
         # A homography's distances are those in image 2, a fundamental matrix's those in both images.
         scales = [S2] if found.model == "homography" else [S1, S2]
         scale = float(torch.stack([S.diagonal()[:2] for S in scales]).mean())
