@@ -15,63 +15,61 @@ from kornia_learnnorm.models.fundamental import Fundamental
 
 
 class LearnedEstimate(NamedTuple):
-    """Fundamental matrices of a batch of image pairs, and what the layer makes of their correspondences."""
+    """Fundamental matrices of a batch of image pairs, and the inlier probabilities of their correspondences."""
 
     F_mat: Tensor  # of rank 2 and unit Frobenius norm, x2^T F x1 = 0, (B, 3, 3)
     E_mat: Tensor | None  # K2^T F K1 with unit Frobenius norm, (B, 3, 3), or None without cameras
     determined: Tensor  # whether the correspondences determine a matrix, (B,) bool; see TwoViewEstimate
     gap: Tensor  # relative gap of the design matrix that `determined` is decided on, (B,)
-    # Probability of each correspondence to be an inlier of the matrix, (B, N); zero for absent ones, one half in sets
-    # that do not determine their matrix.
+    # Inlier probability of each correspondence, (B, N); zero for absent ones, one half in sets that are not determined.
     weights: Tensor
-    stages: tuple[StageEstimate, ...]  # what each stage gives, before its refinement, the last one last
+    stages: tuple[StageEstimate, ...]  # result of each stage before its refinement, in order
 
 
 class LearnedEightPoint(LearnedLayer):
     r"""Estimate the fundamental matrix from matches with outliers in one differentiable pass.
 
-    Each stage reads the correspondences and, from the second on, their distances under the matrix of the stage before.
-    It predicts a logit for every correspondence and the parameters of two transforms. The weighted eight-point
-    algorithm follows, with weights
+    The network of each stage reads the correspondences and, from the second stage on, their distances under the matrix
+    of the stage before. It predicts a logit :math:`l_i` for every correspondence and the parameters :math:`p` of two
+    transforms. The weighted eight-point algorithm follows, with weights
 
     .. math:: w_i = \frac{\sigma(l_i)}{\|(F x_1)_{1:2}\|^2 + \|(F^\top x_2)_{1:2}\|^2}
 
-    (in the first stage :math:`\sigma(l_i)`) and transforms :math:`T = B(p)\, T_{Hartley}`, where :math:`B` builds an
-    SPD transform and Hartley's is that of the weighted points. A few robust steps of Levenberg-Marquardt on the Sampson
-    distances, weighted by :math:`\sigma(l_i)`, end each stage unless a search does
-    (:func:`~kornia_learnnorm.estimators.optimize.refine_unrolled`).
+    (in the first stage :math:`\sigma(l_i)`) and transforms :math:`T = B(p)\, T_{Hartley}`, where :math:`B` builds a
+    symmetric positive definite transform and :math:`T_{Hartley}` normalises the weighted points. Each stage ends with a
+    few robust Levenberg-Marquardt steps on the Sampson distances, weighted by :math:`\sigma(l_i)`
+    (:func:`~kornia_learnnorm.estimators.optimize.refine_unrolled`), or with the search.
 
-    In the last stage of sets of 16 correspondences and more, with :math:`\sum_i \sigma(l_i) \ge 8`, samples are drawn
-    by :math:`\sigma(l_i)`: minimal ones of seven, and a third as many of 20, which average the noise. Of their matrices
-    and the network's, the one of least robust cost over all correspondences is fitted to all of them, weighted by
-    :math:`\sigma(l_i)^{0.2}`. In evaluation, those of them with a mean :math:`\sigma(l_i)` above 0.7 in the first stage
-    leave the other stages and the minimal samples out.
+    The search in the last stage is for sets of 16 or more correspondences with :math:`\sum_i \sigma(l_i) \ge 8`. It
+    draws samples by :math:`\sigma(l_i)`: minimal samples of seven, and a third as many samples of 20, which average the
+    noise. Of their matrices and the network's, the one of least robust cost over all correspondences is fitted to all
+    of them, weighted by :math:`\sigma(l_i)^{0.2}`. In evaluation mode, sets of 16 or more with a mean
+    :math:`\sigma(l_i)` above 0.7 in the first stage skip the other stages and the minimal samples.
 
-    Eight correspondences determine their null matrix whatever the weights: there the result is its weighted optimal
-    correction, :func:`~kornia_learnnorm.optimal_rank2`, or Hartley's projection where the correction leaves the
-    eight more than 1 % of their mean distance from the centroid away: some of them are outliers then. The networks
-    get a gradient of zero.
+    Eight correspondences determine their null vector whatever the weights. The result is then its weighted optimal
+    correction, :func:`~kornia_learnnorm.optimal_rank2`. If the correction leaves the eight more than 1 % of their mean
+    distance from the centroid away, some are outliers, and the result is Hartley's projection. The networks get a
+    gradient of zero.
 
-    The order of the correspondences has no effect. Swapping the views gives :math:`F^\top` up to sign. Moving both
-    images by one translation and scaling them by one factor moves :math:`F` along; rotations and different factors are
-    only trained.
+    The order of the correspondences has no effect. Swapping the views gives :math:`F^\top` up to sign. :math:`F` is
+    equivariant to a translation and a scale that are common to both images; to rotations and different scales only
+    approximately, by training.
 
     Args:
         width: channels of the networks.
         depth: blocks of each stage's network.
         stages: number of stages.
-        learn_transforms: predict transforms; without, they are Hartley's of the weighted points, and the heads of the
-            networks get no gradient (``find_unused_parameters=True`` of DistributedDataParallel).
+        learn_transforms: predict transforms; otherwise they are Hartley's of the weighted points, and the heads of the
+            networks get no gradient (set ``find_unused_parameters=True`` in DistributedDataParallel).
         rank2: how the singularity constraint is enforced, see :func:`kornia_learnnorm.find_fundamental`.
-        refine_steps: steps of the refinement of the last stage, and at most three of the others; 0 refines none.
-            Derivatives are those of the steps: 40 bring them closer to those of the optimum.
-        samples: minimal samples in the last stage; without (0), there are none of 20 either, and the last fit is that
-            of the other stages.
+        refine_steps: refinement steps in the last stage, and at most three in the others; 0 turns refinement off.
+            Gradients are the derivatives of these steps: 40 steps bring them closer to those of the optimum.
+        samples: minimal samples of the search; 0 turns the search off.
 
     Attributes:
-        detach_stages: send no gradient from a stage into the one before and don't refine the last, as when the layer
-            itself is trained; a loss of every stage takes its place.
-        trained_on: names of the data that the weights were trained on, saved with them; empty where not known.
+        detach_stages: for training the layer itself with a loss of every stage: no gradient passes from a stage to the
+            one before, and the last stage is not refined.
+        trained_on: names of the data that the weights were trained on, saved with them; empty if unknown.
 
     Raises:
         ValueError: if a number is not whole or too small, ``learn_transforms`` is no bool, or ``rank2`` is neither
@@ -127,14 +125,14 @@ class LearnedEightPoint(LearnedLayer):
         K1: Tensor | None = None,
         K2: Tensor | None = None,
     ) -> LearnedEstimate:
-        r"""Return the fundamental matrices, the weights of the correspondences and what each stage gives.
+        r"""Return the fundamental matrices, the inlier probabilities and the result of each stage.
 
-        Shapes and errors are those of :meth:`~kornia_learnnorm.EightPoint.estimate`, but for those of the scores.
+        Shapes and errors are those of :meth:`~kornia_learnnorm.EightPoint.estimate`, and those of the scores below.
 
         Args:
             points1: pixels in the first view with shape :math:`(B, N, 2)`, :math:`N \ge 8`.
             points2: pixels in the second view.
-            weights: optional; they multiply the predicted ones.
+            weights: optional; they multiply the predicted weights.
             mask: optional, true for the rows that are correspondences.
             scores: optional scores of the matches with shape :math:`(B, N)`, 1 minus Lowe's ratio or a matcher's
                 confidence, from 0 to 1, which the networks read.

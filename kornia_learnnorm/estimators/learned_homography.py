@@ -1,4 +1,4 @@
-r"""The learned homography: a matrix between two views of a plane, or of a camera that only rotates, from matches."""
+r"""The learned homography: from matches of a plane, or of a camera that only rotates."""
 
 from __future__ import annotations
 
@@ -26,31 +26,31 @@ class HomographyStage(NamedTuple):
 
 
 class HomographyEstimate(NamedTuple):
-    """Homographies of a batch of image pairs, and what the layer makes of their correspondences."""
+    """Homographies of a batch of image pairs, and the inlier probabilities of their correspondences."""
 
     H_mat: Tensor  # of unit Frobenius norm, map homogeneous pixels of image 1 to image 2, (B, 3, 3)
     determined: Tensor  # whether the correspondences determine an invertible matrix, (B,) bool
     gap: Tensor  # relative gap of the design matrix that `determined` is decided on, (B,)
-    # Probability of each correspondence to be an inlier of the matrix, (B, N); zero for absent ones, one half in sets
-    # that do not determine their matrix.
+    # Inlier probability of each correspondence, (B, N); zero for absent ones, one half in sets that are not determined.
     weights: Tensor
-    stages: tuple[HomographyStage, ...]  # what each stage gives, before its refinement, the last one last
+    stages: tuple[HomographyStage, ...]  # result of each stage before its refinement, in order
 
 
 class LearnedHomography(LearnedLayer):
     r"""Estimate the homography of a plane, or of a camera that only rotates, from matches with outliers in one pass.
 
-    The sibling of :class:`~kornia_learnnorm.LearnedEightPoint` for homographies, differentiable too. Each stage's
-    network predicts a logit for every correspondence and two transforms, the weighted DLT follows in their
-    coordinates, and reweighted least squares of the Sampson distances refine its matrix. In the last stage of sets of
-    eight correspondences and more, minimal samples of four are drawn by the probabilities. Of their matrices and the
-    network's, the one of least robust cost over all correspondences is fitted to all of them, nearly whatever their
-    probabilities: full ones leave out true matches that the matrix needs where noise is coarse. In evaluation, sets of
-    16 correspondences and more with a mean probability above 0.7 in the first stage leave the other stages out.
+    It is :class:`~kornia_learnnorm.LearnedEightPoint` for homographies, differentiable too. The network of each stage
+    predicts an inlier probability for every correspondence and two transforms, the weighted DLT follows in their
+    coordinates, and reweighted least squares on the Sampson distances refines its matrix. In the last stage of sets of
+    eight or more correspondences, minimal samples of four are drawn by the probabilities. Of their matrices and the
+    network's, the one of least robust cost over all correspondences is fitted to all of them. The probabilities have
+    little weight in this fit: where noise is coarse, full weights suppress correct matches that the matrix needs. In
+    evaluation mode, sets of 16 or more correspondences with a mean probability above 0.7 in the first stage skip the
+    other stages.
 
     Four correspondences determine their matrix exactly, whatever the weights; the networks get a gradient of zero. The
-    order of the correspondences has no effect. Swapping the views gives :math:`H^{-1}` up to scale. Moving both images
-    by one translation and scaling them by one factor moves :math:`H` along.
+    order of the correspondences has no effect. Swapping the views gives :math:`H^{-1}` up to scale. :math:`H` is
+    equivariant to a translation and a scale that are common to both images.
 
     Do not use it on scenes with relief: it returns the homography that most matches agree on, without a warning.
 
@@ -58,9 +58,9 @@ class LearnedHomography(LearnedLayer):
         width: channels of the networks.
         depth: blocks of each stage's network.
         stages: number of stages.
-        refine_steps: reweightings in the last stage, and at most three in the others. Derivatives are those of the
-            steps: of many, they are huge where few matches are inliers.
-        samples: minimal samples in the last stage; without (0), the last fit begins at the network's matrix.
+        refine_steps: reweightings in the last stage, and at most three in the others. Gradients are the derivatives of
+            these steps: many steps make them huge where few matches are inliers.
+        samples: minimal samples in the last stage; with 0, the last fit begins at the network's matrix.
 
     Attributes and errors are those of :class:`~kornia_learnnorm.LearnedEightPoint`.
 
@@ -96,7 +96,7 @@ class LearnedHomography(LearnedLayer):
     def from_eight_point(
         cls, layer: LearnedEightPoint, stages: int = 2, refine_steps: int = 3, samples: int = 64
     ) -> LearnedHomography:
-        """Return an untrained estimator whose networks start from the first ones of one of fundamental matrices.
+        """Return an untrained estimator whose networks start from those of an estimator of fundamental matrices.
 
         Stages beyond those of ``layer`` are new.
         """
@@ -111,14 +111,14 @@ class LearnedHomography(LearnedLayer):
         mask: Tensor | None = None,
         scores: Tensor | None = None,
     ) -> HomographyEstimate:
-        r"""Return the homographies, the weights of the correspondences and what each stage gives.
+        r"""Return the homographies, the inlier probabilities and the result of each stage.
 
-        Arguments, shapes and errors are those of :meth:`~kornia_learnnorm.LearnedEightPoint.estimate`, but for the
-        cameras, with :math:`N \ge 4`.
+        Arguments, shapes and errors are those of :meth:`~kornia_learnnorm.LearnedEightPoint.estimate`, without cameras
+        and with :math:`N \ge 4`.
 
         Returns:
             the matrices, weights and stages, in the dtype of the points. Sets that do not determine an invertible
-            matrix, such as fewer than four different correspondences or four of which three are on a line, get the
+            matrix, such as fewer than four different correspondences or four of which three are collinear, get the
             identity, without gradient.
         """
         problem, found = self._estimate(points1, points2, weights, mask, scores)

@@ -35,7 +35,7 @@ class PoseStage(NamedTuple):
 
 
 class RelativePoseEstimate(NamedTuple):
-    """Relative poses of a batch of image pairs, and what the layer makes of their correspondences."""
+    """Relative poses of a batch of image pairs, and the inlier probabilities of their correspondences."""
 
     E_mat: Tensor  # essential matrices of unit Frobenius norm, x2^T K2^-T E K1^-1 x1 = 0, (B, 3, 3)
     F_mat: Tensor  # K2^-T E K1^-1 with unit Frobenius norm, (B, 3, 3)
@@ -43,8 +43,7 @@ class RelativePoseEstimate(NamedTuple):
     t: Tensor  # translations of unit length, (B, 3)
     determined: Tensor  # whether the correspondences allow for finitely many matrices, (B,) bool
     gap: Tensor  # relative gap of the design matrix that `determined` is decided on, (B,)
-    # Probability of each correspondence to be an inlier of the matrix, (B, N); zero for absent ones, one half in sets
-    # that do not determine their matrix.
+    # Inlier probability of each correspondence, (B, N); zero for absent ones, one half in sets that are not determined.
     weights: Tensor
     stages: tuple[PoseStage, ...]  # the last one holds the result
 
@@ -52,32 +51,32 @@ class RelativePoseEstimate(NamedTuple):
 class LearnedRelativePose(LearnedLayer):
     r"""Estimate the relative pose of calibrated cameras from matches with outliers in one differentiable pass.
 
-    The essential sibling of :class:`~kornia_learnnorm.LearnedEightPoint`. Its networks also read the directions of both
-    points, the size of the set in pixels and, from the second stage on, the distances in pixels. In each stage the
-    weighted design rows of all matches give a :math:`9 \times 9` matrix of moments. Candidates are the essential
+    It is :class:`~kornia_learnnorm.LearnedEightPoint` for calibrated cameras. Its networks also read the viewing rays
+    of both points, the size of the set in pixels and, from the second stage on, the distances in pixels. In each stage
+    the weighted rows of the design matrix give a :math:`9 \times 9` matrix of moments. The candidates are the essential
     matrices in the span of its four smallest eigenvectors
-    (:func:`~kornia_learnnorm.geometry.five_point.essential_in_span`), the nearest one to the smallest eigenvector, that
-    of the stage before and, in the last stage, those of minimal samples drawn by the weights. The one of least robust
-    cost is refined by reweighted least squares of the Sampson distances over the five parameters of a relative pose,
-    which carries the gradients. Where fewer than four tenths of the correspondences agree with it, as many samples are
-    drawn again near it. In evaluation, sets of 16 correspondences and more with a mean probability above 0.7 in the
-    first stage leave out its matrix, the other networks and half of the samples.
+    (:func:`~kornia_learnnorm.geometry.five_point.essential_in_span`), the one nearest to the smallest eigenvector, that
+    of the stage before and, in the last stage, those of minimal samples drawn by the weights. The candidate of least
+    robust cost is refined by reweighted least squares on the Sampson distances over the five parameters of a relative
+    pose; the refinement carries the gradients. Where fewer than four tenths of the correspondences agree with it, as
+    many samples are drawn again near it. In evaluation mode, sets of 16 or more correspondences with a mean probability
+    above 0.7 in the first stage skip the matrix of that stage, the other networks and half of the samples.
 
-    Cameras may be inexact, or lenses distort: where the correspondences contradict them by a score test, and a pose
-    without them has at most three times the standard error and fits to a few pixels, the pose is that of the refined
-    fundamental matrix.
+    If a score test finds that the correspondences contradict the cameras (inexact intrinsics or lens distortion), the
+    pose is that of a refined fundamental matrix, provided that its standard error is at most three times as large and
+    it fits to a few pixels.
 
     The order of the correspondences has no effect. Swapping the views, with their cameras, gives :math:`E^\top` up to
-    sign. Of five correspondences, which up to ten matrices fit exactly, rounding may choose one. Planes and cameras
-    that move forward are solved as other scenes are; a camera that only rotates has no translation, and some direction
-    is returned. Undistort the points before where the distortion is known.
+    sign. Up to ten matrices fit five correspondences exactly; rounding may then choose one. Planes and forward motion
+    need no special treatment. A camera that only rotates has no translation: the returned direction is arbitrary.
+    Undistort the points first if the distortion is known.
 
     Args:
         width: channels of the networks.
         depth: blocks of each stage's network.
         stages: number of stages.
-        refine_steps: reweightings in the last stage, and at most two in the others. Derivatives are those of the steps:
-            more steps bring them closer to those of the optimum where most correspondences are right.
+        refine_steps: reweightings in the last stage, and at most two in the others. Gradients are the derivatives of
+            these steps: more steps bring them closer to those of the optimum where most correspondences are right.
         samples: minimal samples in the last stage.
 
     Attributes and errors are those of :class:`~kornia_learnnorm.LearnedEightPoint`; with ``detach_stages`` there are no
@@ -115,10 +114,10 @@ class LearnedRelativePose(LearnedLayer):
     def from_eight_point(
         cls, layer: LearnedEightPoint, stages: int = 2, refine_steps: int = 5, samples: int = 64
     ) -> LearnedRelativePose:
-        """Return an untrained estimator whose networks start from the first ones of one of fundamental matrices.
+        """Return an untrained estimator whose networks start from those of an estimator of fundamental matrices.
 
-        What only they read, directions and distances in pixels, has no effect yet. Stages beyond those of ``layer`` are
-        new.
+        Their additional inputs, rays and distances in pixels, have no effect before training. Stages beyond those of
+        ``layer`` are new.
         """
         return cls(layer.width, layer.depth, stages, refine_steps, samples).start_from(layer)
 
@@ -151,16 +150,16 @@ class LearnedRelativePose(LearnedLayer):
         mask: Tensor | None = None,
         scores: Tensor | None = None,
     ) -> RelativePoseEstimate:
-        r"""Return essential matrices, poses, the weights of the correspondences and what each stage gives.
+        r"""Return essential matrices, poses, the inlier probabilities and the result of each stage.
 
         Arguments, shapes and errors are those of :meth:`~kornia_learnnorm.LearnedEightPoint.estimate`, with
         :math:`N \ge 5`; the cameras are needed, and the points must be pixels.
 
         Returns:
             the matrices, poses, weights and stages, in the dtype of the points. Of the four poses of an essential
-            matrix it is the one with most weight of correspondences in front of both cameras. Sets that do not
-            determine a matrix, such as fewer than five different correspondences, get one of a sideways motion,
-            without gradient.
+            matrix, the one with the largest weight of correspondences in front of both cameras is returned. Degenerate
+            sets, such as fewer than five different correspondences, get the pose of a sideways motion, without
+            gradient.
         """
         problem, cameras, determined, gap, states, logits = self._pose_stages(
             points1, points2, K1, K2, weights, mask, scores
