@@ -1,4 +1,4 @@
-r"""RANSAC whose minimal samples and refits run through a normaliser, or through known cameras."""
+r"""RANSAC for fundamental matrices, essential matrices and homographies."""
 
 import math
 import time
@@ -41,61 +41,61 @@ class RansacResult(NamedTuple):
     inliers: Tensor  # which correspondences are inliers, (N,) bool
     num_samples: int  # minimal samples drawn
     score: float  # MSAC score of `F_mat`, the sum of max(0, 1 - d^2 / threshold^2) over the correspondences
-    # Of unit norm, singular values (s, s, 0), nearest to K2^T F K1, (3, 3); with it F = K2^-T E K1^-1 up to scale, but
-    # where the correspondences contradict the cameras. None without cameras.
+    # Nearest to K2^T F K1, with unit norm and singular values (s, s, 0), (3, 3); None without cameras. Up to scale,
+    # F = K2^-T E K1^-1, unless the correspondences contradict the cameras.
     E_mat: Tensor | None = None
 
 
 class RANSAC(nn.Module):
-    r"""Robust estimation of a fundamental matrix from correspondences with outliers.
+    r"""Estimate a fundamental matrix, an essential matrix or a homography from correspondences with outliers.
 
-    Minimal samples of seven are solved a thousand at once, or with a normaliser samples of eight by
-    :func:`~kornia_learnnorm.find_fundamental`, and MSAC scores their matrices. The best of each batch are fitted to
-    their inliers by reweighted least squares, and the first also by the normaliser (local optimisation); the inliers of
-    the best matrix so far say how many samples are still needed. Where they are few, or the samples run out, the last
-    samples are drawn near the best matrix. In the end the best few are fitted on Geman and McClure's loss, and the one
-    of least cost goes on to Levenberg-Marquardt where least squares have not converged.
+    Minimal samples of seven, or with a normaliser samples of eight for :func:`~kornia_learnnorm.find_fundamental`, are
+    solved in batches, and MSAC scores their matrices. In local optimisation, the best matrices of each batch are fitted
+    to their inliers by reweighted least squares, and the first also by the normaliser. The inlier ratio of the best
+    matrix so far decides how many samples are still needed. If it is low, or the samples run out, the last samples are
+    drawn near the best matrix. At the end the best matrices are fitted with the Geman-McClure loss, and the one of
+    least cost is refined by Levenberg-Marquardt if least squares have not converged.
 
     With both cameras, minimal samples of five run through Nister's five-point solver, and local optimisation and the
-    final fit are least squares on essential matrices; distances stay in pixels. Where a fundamental matrix then
-    fits so much better that chance explains it with a probability below 0.001, and its pose has at most three times the
-    standard error and still fits, the cameras are inexact, or a lens or a shutter is not that of a pinhole: the result
-    is this matrix. ``normalizer`` and ``rank2`` have no effect.
+    final fit are least squares on essential matrices; distances stay in pixels. The cameras are dropped, and the result
+    is a fundamental matrix, if that fits better than chance explains (with a probability below 0.001) and its pose
+    still fits with at most three times the standard error: the intrinsics are then inexact, or the lens or shutter is
+    not that of a pinhole camera. ``normalizer`` and ``rank2`` have no effect with cameras.
 
-    Matches that share a point exactly, in either view, with a match of higher weight, or of the same weight and before
-    them, are treated as absent: many matches on one point agree with every epipolar line through it.
+    Of matches that share a point exactly, in either view, only the one of highest weight counts, or the first among
+    equals: many matches on one point agree with every epipolar line through it.
 
-    On the CPU, PyTorch is held to one thread meanwhile, see :func:`~kornia_learnnorm.ransac.threads.one_thread`.
+    On the CPU, PyTorch uses one thread during a call, see :func:`~kornia_learnnorm.ransac.threads.one_thread`.
 
-    :meth:`forward` takes and returns what that of ``kornia.geometry.RANSAC(model_type="fundamental_8pt")`` does; the
-    constructor's arguments differ, the matrix has unit Frobenius norm, and weights steer the sampling.
+    :meth:`forward` has the arguments and results of that of ``kornia.geometry.RANSAC(model_type="fundamental_8pt")``;
+    the constructor's arguments differ, the matrix has unit Frobenius norm, and weights guide the sampling.
 
     Args:
         normalizer: maps ``(points1, points2, weights)`` to the transforms of both views, for samples of eight and for
             the refits of local optimisation. Leave it out to draw samples of seven, of which fewer are needed.
         inl_th: largest distance of an inlier, pixels.
         max_samples: largest number of minimal samples (Kornia's ``max_iter`` counts batches of 2,048).
-        max_seconds: time after which no further batch of samples, 64 at first and up to 1,024, is drawn; with it the
+        max_seconds: time after which no further batch of samples (64 at first, up to 1,024) is drawn; with it the
             result depends on the machine.
-        confidence: probability, in :math:`(0, 1]`, that sampling does not stop before a sample without outliers, if the
-            best matrix so far has found all inliers; 1 draws all ``max_samples`` samples. By default 0.999999, since a
-            sample must not have much noise either, 0.9999 for a homography, and 0.999 with cameras, which leave noise
-            less room.
+        confidence: probability, in :math:`(0, 1]`, that a sample without outliers is drawn before sampling stops, if
+            the best matrix so far has all inliers; 1 draws all ``max_samples`` samples. By default 0.999999, because a
+            sample must have little noise, too; 0.9999 for a homography; and 0.999 with cameras, which reduce the effect
+            of noise.
         distance: ``"sampson"``, or ``"symmetric"`` (Fan et al., Eq. 7).
         rank2: how the singularity constraint is enforced on samples of eight: ``"projection"`` in the normaliser's
             coordinates (Hartley's when not given), the default with a ``normalizer``, or ``"optimal"`` correction.
             Matrices of samples of seven are singular.
-        refine: whether to optimise; otherwise the result is the minimal sample of highest score.
+        refine: whether to optimise; otherwise the result is the matrix of highest score among the minimal samples.
         seed: makes every call on the same input and device give the same result; None draws from PyTorch's generator.
-        model: ``"fundamental"``, ``"homography"``, or a model of one's own in place of one of that ``distance`` and
-            ``rank2``. A homography has minimal samples of four, no cameras and no ``rank2``; its symmetric distance is
-            the root of the sum of both squared transfer errors.
+        model: ``"fundamental"``, ``"homography"``, or a model of your own, which replaces ``distance`` and ``rank2``. A
+            homography has minimal samples of four, no cameras and no ``rank2``; its symmetric distance is the root of
+            the sum of both squared transfer errors.
 
     Raises:
-        TypeError: if ``normalizer`` cannot be called, or ``inl_th``, ``confidence``, ``max_seconds`` or ``seed`` is no
-            number.
-        ValueError: if a number is out of its range, ``max_samples`` is not whole, or there is no such ``model``,
-            ``distance`` or ``rank2``.
+        TypeError: if ``normalizer`` cannot be called, or ``inl_th``, ``confidence``, ``max_seconds`` or ``seed`` is not
+            a number.
+        ValueError: if a number is out of its range, ``max_samples`` is not whole, or ``model``, ``distance`` or
+            ``rank2`` is unknown.
 
     Reference:
         P. Torr, A. Zisserman, MLESAC, CVIU 2000 (MSAC); O. Chum, J. Matas, J. Kittler, Locally optimized RANSAC, DAGM
@@ -171,26 +171,27 @@ class RANSAC(nn.Module):
         K1: Tensor | None = None,
         K2: Tensor | None = None,
     ) -> RansacResult:
-        r"""Estimate the fundamental matrix of one image pair, and with cameras the essential matrix.
+        r"""Estimate the matrix of one image pair: fundamental or homography, and with cameras also essential.
 
         Args:
             points1: pixels in the first image with shape :math:`(N, 2)`, :math:`N \ge 8`, with cameras
                 :math:`N \ge 5`, float32 or float64. Rows that are not finite, more than 1e6 median distances from the
-                other points, or share a point with a better match, are no inliers.
+                other points, or share a point with a better match, are not inliers.
             points2: pixels in the second image with shape :math:`(N, 2)`.
             weights: optional non-negative scores :math:`(N,)`, higher is better, such as one minus Lowe's ratio or
-                LightGlue's scores. Matches are sampled in proportion to their squares, never where they are zero; of
-                matches that share a point, the one of highest weight counts.
+                LightGlue's scores. Matches are sampled in proportion to the squares of their weights, so a match of
+                weight zero is never sampled; of matches that share a point, the one of highest weight counts.
             K1: optional camera of the first image with shape :math:`(3, 3)`.
             K2: optional camera of the second image with shape :math:`(3, 3)`; both or none.
 
         Returns:
-            the matrix :math:`(3, 3)`, :math:`x_2^\top F x_1 = 0`, the inliers of the matrix before it is rounded to the
-            dtype of the points, the number of samples and the score; no gradients. Zeros and no inliers where no matrix
-            of rank 2 was found that has more than eight inliers, or five with cameras, and where fewer weights than
-            that are positive. Where every sample is degenerate, as on a plane without noise or under no motion, the
-            matrix is one of those that fit. With cameras a plane has at most two. A homography is in the same field
-            ``F_mat``, from :math:`N \ge 4` matches of which more than four are inliers.
+            the matrix ``F_mat`` :math:`(3, 3)`, :math:`x_2^\top F x_1 = 0`, its inliers before it is rounded to the
+            dtype of the points, the number of samples and the score; no gradients. ``F_mat`` also holds a homography,
+            from :math:`N \ge 4` matches of which more than four are inliers.
+
+            If no matrix of rank 2 has more than eight inliers (five with cameras), or fewer than eight (five) weights
+            are positive, the matrix is zero and there are no inliers. If every sample is degenerate, as on a plane
+            without noise or without motion, the matrix is one of those that fit; with cameras, at most two fit a plane.
 
         Raises:
             TypeError: if the points are not floating-point tensors of one dtype, or weights or cameras not
