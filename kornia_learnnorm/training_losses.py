@@ -1,4 +1,4 @@
-"""Losses of matrices: of samples, of matches with outliers without labels, and with ground truth."""
+"""Training losses: of samples, of matches with outliers and without labels, and with ground truth."""
 
 from collections.abc import Callable
 
@@ -14,19 +14,20 @@ MAX_DISTANCE = 1e4  # pixels; larger distances count as this and send no gradien
 
 
 class EpipolarLoss(nn.Module):
-    r"""Residuals on the sample's own points and on held-out ones, the paper's self-supervision.
+    r"""Residuals on the sample's own points and on held-out points: the self-supervised loss of Fan et al.
 
     With ``log=False``, the mean residual of a sample is averaged over the batch (Fan et al., Eq. 7). With ``log=True``,
-    its logarithm is, so that a few bad samples do not outweigh the rest. Held-out correspondences enter one by one.
+    the logarithm of this mean is averaged, so that a few bad samples do not dominate. The logarithm of held-out
+    residuals is taken of each correspondence.
 
     Args:
         residual: maps ``(points1, points2, F_mat)`` to residuals :math:`(B, N)`, such as
             :func:`~kornia_learnnorm.symmetric_epipolar_distance` or :func:`~kornia_learnnorm.sampson_distance`.
         log: average the logarithm instead of the residual.
-        heldout_weight: share of the held-out part, 0 to 1.
+        heldout_weight: share of the held-out residuals in the loss, 0 to 1.
         floor: added to the residuals under the logarithm, in their unit.
         heldout_floor: the same for held-out residuals, which do not fit far below a pixel.
-        ceiling: residuals above this, also infinite ones, count as this much and send no gradient.
+        ceiling: residuals above this, also infinite ones, are clamped to it and send no gradient.
 
     ValueError if ``heldout_weight`` is outside 0 to 1, or a floor or the ceiling is not positive.
 
@@ -90,8 +91,8 @@ def _distances(residual: Residual, points1: Tensor, points2: Tensor, M: Tensor, 
 class BoundedEpipolarLoss(nn.Module):
     r"""Mean of :math:`d^2 / (d^2 + s^2)` over matches with outliers, for training without labels.
 
-    :math:`d` is the symmetric epipolar distance (Fan et al., Eq. 7). A match far from its lines costs one and pulls
-    little, so that the matrix that explains most matches has the least loss.
+    :math:`d` is the symmetric epipolar distance (Fan et al., Eq. 7). A match far from its lines costs at most one
+    and has little gradient, so the matrix that explains most matches has the least loss.
 
     Args:
         scale: distance :math:`s` in pixels at which a match costs one half; ValueError unless positive.
@@ -142,8 +143,8 @@ class LogEpipolarLoss(nn.Module):
 class LogEssentialLoss(nn.Module):
     r"""Logarithm of the chordal distance :math:`d` of essential matrices of unit norm, :math:`\log \sqrt{d^2 + f^2}`.
 
-    The nearer sign counts. For small angles, in radians, the distance is that of the translations, or 0.7 to 1 times
-    that of the rotations.
+    The sign of the essential matrix that gives the smaller distance counts. For small errors :math:`d` is the angle in
+    radians between the translations, or 0.7 to 1 times the angle between the rotations.
 
     Args:
         floor: distance :math:`f`, far below which nothing is gained; ValueError unless positive.
@@ -169,7 +170,7 @@ class LogEssentialLoss(nn.Module):
 
 
 class InlierLoss(nn.Module):
-    """Cross-entropy of the logits of inliers; correspondences of unknown kind, NaN, don't count.
+    """Cross-entropy of inlier logits and labels; correspondences with a label of NaN are ignored.
 
     Example:
         >>> InlierLoss()(torch.tensor([[0.0, 9.0]]), torch.tensor([[1.0, torch.nan]]))
@@ -177,7 +178,7 @@ class InlierLoss(nn.Module):
     """
 
     def forward(self, logits: Tensor, inliers: Tensor) -> Tensor:
-        """Return the loss of each set, (B,), of logits (B, N) and inliers (B, N): one, zero or NaN."""
+        """Return the loss of each set, (B,), of logits (B, N) and labels ``inliers`` (B, N): one, zero or NaN."""
         known = ~inliers.isnan()
         target = torch.where(known, inliers, 0.0).to(logits)
         logits = torch.where(known, logits, 0.0)  # which may be NaN

@@ -32,8 +32,8 @@ def find_fundamental(
     r"""Compute the fundamental matrix from eight or more correspondences by the normalised eight-point algorithm.
 
     The points are mapped to normalised coordinates :math:`\hat x_i = T_i x_i`, the direct linear transformation (DLT)
-    finds :math:`\hat F` with :math:`\hat x_2^\top \hat F \hat x_1 = 0`, the rank-2 constraint is enforced **there**,
-    and :math:`F = T_2^\top \hat F T_1`. With eight points the DLT is exact, and the normalisation acts only through the
+    finds :math:`\hat F` with :math:`\hat x_2^\top \hat F \hat x_1 = 0`, :math:`\hat F` is made singular, and
+    :math:`F = T_2^\top \hat F T_1`. With eight points the DLT is exact, and the normalisation acts only through the
     metric in which :math:`F` is projected. With ``rank2="optimal"``, :math:`T_2^\top \hat F T_1` is corrected by
     :func:`~kornia_learnnorm.optimal_rank2` instead; eight points then need no normalisation, and the normaliser is not
     called.
@@ -42,8 +42,8 @@ def find_fundamental(
         points1: pixels in the first image with shape :math:`(B, N, 2)`, :math:`N \ge 8`, float32 or float64.
         points2: pixels in the second image with shape :math:`(B, N, 2)`.
         weights: optional non-negative weights :math:`(B, N)` of the squared algebraic residuals; zero means absent.
-        normalizer: maps ``(points1, points2, weights)`` to the transforms :math:`(B, 3, 3)` of both views;
-            :class:`~kornia_learnnorm.Hartley` when not given.
+        normalizer: maps ``(points1, points2, weights)`` to the transforms :math:`(B, 3, 3)` of both views; default
+            :class:`~kornia_learnnorm.Hartley`.
         rank2: how the singularity constraint is enforced: ``"projection"`` in Frobenius norm in normalised coordinates,
             or ``"optimal"`` correction with the covariance of :math:`F`.
 
@@ -185,9 +185,9 @@ class TwoViewEstimate(NamedTuple):
         E_mat: :math:`K_2^\top F K_1` with unit Frobenius norm, (B, 3, 3), or None without cameras. Its singular values
             are :math:`(\sigma_1, \sigma_2, 0)`, not projected to equal ones.
         determined: whether the correspondences determine the matrix, ``gap > 1e-6``, (B,) bool. Where they do not
-            (fewer than eight of positive weight, coincident, collinear, coplanar), it is the base normaliser's and
-            carries no gradient. It is a rank test: a plane with 0.01 px of noise passes.
-        gap: relative gap of the design matrix, from 0 to 1, that ``determined`` is decided on, (B,); see
+            (fewer than eight of positive weight, coincident, collinear, coplanar), the matrix is that of the base
+            normaliser and carries no gradient. This is a rank test: a plane with 0.01 px of noise passes.
+        gap: relative gap of the design matrix, from 0 to 1, which decides ``determined``, (B,); see
             :func:`~kornia_learnnorm.geometry.dlt.solve_rows`. Errors grow as its inverse.
     """
 
@@ -200,21 +200,21 @@ class TwoViewEstimate(NamedTuple):
 class EightPoint(LinearLayer):
     r"""The normalised eight-point algorithm as an nn.Module, with finite outputs and gradients on degenerate samples.
 
-    They are finite for points within 1e50 of the origin whose mean distance from their centroid is zero or at least
-    1e-50. A correspondence that is masked, or of weight zero, counts as absent. A sample that does not determine its
-    matrix is solved with the base normaliser (``normalizer.base`` where there is one, else Hartley's) and sends no
-    gradient, neither to the points nor to the normaliser.
+    Outputs and gradients are finite for points within 1e50 of the origin whose mean distance from their centroid is
+    zero or at least 1e-50. A correspondence that is masked or has weight zero is ignored. A degenerate sample is solved
+    with the base normaliser (``normalizer.base`` if it exists, otherwise Hartley's) and sends no gradient, neither to
+    the points nor to the normaliser.
 
     Do not use it on matches with outliers: it is least squares. :class:`~kornia_learnnorm.RANSAC` rejects them.
 
     Args:
-        normalizer: a module or callable ``(points1, points2, weights) -> (T1, T2)``; Hartley's when not given.
+        normalizer: a module or callable ``(points1, points2, weights) -> (T1, T2)``; default Hartley's.
         rank2: how the singularity constraint is enforced, see :func:`kornia_learnnorm.find_fundamental`.
 
     Raises:
         ValueError: if ``rank2`` is neither ``"projection"`` nor ``"optimal"``.
         TypeError: if ``normalizer`` is neither a module nor a function, or the layer is compiled by ``torch.jit``;
-            ``torch.compile`` and ``torch.export`` take it.
+            ``torch.compile`` and ``torch.export`` work.
 
     Example:
         >>> layer = EightPoint()
@@ -245,11 +245,11 @@ class EightPoint(LinearLayer):
         K1: Tensor | None = None,
         K2: Tensor | None = None,
     ) -> TwoViewEstimate:
-        r"""Return the fundamental matrices, which samples determine theirs, and essential matrices where asked for.
+        r"""Return the fundamental matrices, which samples are not degenerate, and with cameras essential matrices.
 
         Args:
             points1: pixels in the first view with shape :math:`(B, N, 2)`, :math:`N \ge 8`, float32 or float64;
-                calibrated coordinates are as good, and give essential matrices.
+                calibrated coordinates work as well, and give essential matrices.
             points2: pixels in the second view with shape :math:`(B, N, 2)`.
             weights: optional non-negative weights with shape :math:`(B, N)`, of any floating-point dtype.
             mask: optional, true for the rows that are correspondences, boolean with shape :math:`(B, N)`. Masked rows

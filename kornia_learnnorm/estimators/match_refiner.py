@@ -1,4 +1,4 @@
-r"""The learned refinement of matches: both points move so that the patches around them agree."""
+r"""The learned sub-pixel refinement of matches: both points move so that the patches around them agree."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ VARIANCE_FLOOR = 1e-4  # of the grey values of a patch, from 0 to 1
 
 
 class RefinedMatches(NamedTuple):
-    """Moved matches and how exact they are."""
+    """Refined matches and their predicted noise."""
 
     points1: Tensor  # pixels, (B, N, 2)
     points2: Tensor
@@ -48,21 +48,21 @@ class RefinedMatches(NamedTuple):
 
 
 class MatchRefiner(nn.Module):
-    r"""Move both points of matches by fractions of a pixel, by the patches around them, and predict their noise.
+    r"""Move both points of a match by fractions of a pixel so that their patches agree, and predict its noise.
 
-    The patches of a match, of zero mean and unit variance, give displacements :math:`d_k` by one step of Lucas and
-    Kanade, of the mean of both gradients, in several Gaussian windows. A network of the patches and of the steps
-    predicts a weight :math:`w_k` of each step, a displacement of its own :math:`r` and the noise. The second point
-    moves by half of
+    The patches of a match are normalised to zero mean and unit variance. One Lucas-Kanade step with the mean of both
+    gradients, in several Gaussian windows, gives displacements :math:`d_k`. A network reads the patches and these
+    steps, and predicts a weight :math:`w_k` of each step, a displacement :math:`r` of its own and the noise. The second
+    point moves by half of
 
     .. math:: \frac{b\, s}{\sqrt{b^2 + \|s\|^2}}, \qquad s = r + \sum_k w_k d_k
 
-    with the bound :math:`b`, the first one by as much the other way. The network is odd in the difference of the
-    patches, so swapping the views swaps the result. Patches are warped by half of the affinity of the neighbouring
-    matches each (:func:`local_frames`), so that they also agree where the views are turned, scaled or slanted against
-    each other. Before training, points stay where they are.
+    with the bound :math:`b`, the first one by as much in the opposite direction. The network is odd in the difference
+    of the patches, so swapping the views swaps the result. Each patch is warped by half of the affine map between
+    neighbouring matches (:func:`local_frames`), so that patches also agree if the views are rotated, scaled or slanted
+    against each other. An untrained refiner moves no points.
 
-    Not for matches that are off by more than two or three pixels: those are left nearly where they are.
+    Do not use it for matches that are off by more than two or three pixels: it hardly corrects them.
 
     Args:
         patch_size: side of the patches, odd, pixels.
@@ -70,8 +70,8 @@ class MatchRefiner(nn.Module):
         bound: largest change of the displacement between both points, pixels; each moves by half of it.
 
     Attributes:
-        passes: how often the points are moved, 1 unless set; 2 bring coarse matches nearer.
-        trained_on: names of the data that the weights were trained on, saved with them; empty where not known.
+        passes: number of refinements, 1 unless set; 2 help coarse matches.
+        trained_on: names of the data that the weights were trained on, saved with them; empty if unknown.
 
     Raises:
         ValueError: if a number is not whole or too small, ``patch_size`` is even, or ``bound`` is not positive.
@@ -115,9 +115,9 @@ class MatchRefiner(nn.Module):
     def forward(
         self, image1: Tensor, image2: Tensor, points1: Tensor, points2: Tensor, mask: Tensor | None = None
     ) -> RefinedMatches:
-        r"""Return the moved matches and the predicted standard deviation of each.
+        r"""Return the refined matches and the predicted standard deviation of each.
 
-        Gradients reach points and images. ``1 / scale`` is a weight for layers.
+        Gradients reach points and images. Pass ``1 / scale`` to layers as weights.
 
         Args:
             image1: first views with shape :math:`(B, C, H, W)`, grey or colour, values from 0 to 1, or bytes.
@@ -130,7 +130,7 @@ class MatchRefiner(nn.Module):
             the matches in the dtype of the points.
 
         Raises:
-            TypeError: if an argument is no tensor of the right kind, or the weights are of half precision.
+            TypeError: if an argument is not a tensor of the right kind, or the weights are of half precision.
             ShapeError: if an argument does not have its shape.
             ValueError: if numbers of images and points differ, or a value is not finite or out of its range.
         """

@@ -20,7 +20,7 @@ Distance = Literal["sampson", "symmetric"]
 
 
 class Refinement(NamedTuple):
-    """Refined fundamental matrices and how they were reached."""
+    """Refined fundamental matrices, with costs and convergence."""
 
     F_mat: Tensor  # of rank 2 and unit Frobenius norm, (B, 3, 3)
     cost_before: Tensor  # weighted sum of the losses in square pixels at the given matrices, projected to rank 2, (B,)
@@ -50,17 +50,17 @@ def refine_fundamental(
     max_iterations: int = 50,
     tolerance: float = 1e-7,
 ) -> Refinement:
-    r"""Refine fundamental matrices to a local minimum of a sum over the correspondences, by Levenberg-Marquardt.
+    r"""Refine fundamental matrices to a local minimum of a robust cost of the correspondences, by Levenberg-Marquardt.
 
     .. math:: \min_{\mathrm{rank} F = 2} \sum_i w_i\, \rho(d_i^2), \quad d_i = x_{2,i}^\top F x_{1,i} \,
               g\big(\|(F^\top x_{2,i})_{1:2}\|^2, \|(F x_{1,i})_{1:2}\|^2\big)
 
-    Each element of the batch has its own damping; a step is taken where it lowers the cost and refused where it does
-    not or cannot be computed, so that :math:`F` is at worst what was given.
+    Each element of the batch has its own damping. A step is accepted only if it lowers the cost, so the result is never
+    worse than the given :math:`F`.
 
     The result is differentiable, once, in points and weights: by the implicit function theorem,
-    :math:`\mathrm dp = -H^{-1} \mathrm d(\nabla_p\, \mathrm{cost})` with the exact Hessian :math:`H`. It does not
-    depend on ``F_mat``. Elements that did not converge or whose :math:`H` is not positive definite carry no gradient.
+    :math:`\mathrm dp = -H^{-1} \mathrm d(\nabla_p\, \mathrm{cost})` with the exact Hessian :math:`H`. ``F_mat`` gets
+    no gradient. Elements that did not converge or whose :math:`H` is not positive definite carry no gradient.
 
     Args:
         points1: pixels in the first image with shape :math:`(B, N, 2)`, :math:`N \ge 8`, float32 or float64; with shape
@@ -77,7 +77,7 @@ def refine_fundamental(
         max_iterations: largest number of steps tried. :class:`~kornia_learnnorm.Huber` often takes more than 50 among
             outliers, and then sends no gradient.
         tolerance: largest cosine between the distances and their derivatives at which a matrix has converged. 1e-3
-            saves half of the steps and more, and leaves the cost within about 0.2 % of the optimum: enough for an
+            saves at least half of the steps and leaves the cost within about 0.2 % of the optimum: enough for an
             estimate, not for its gradient.
 
     Returns:
@@ -88,7 +88,7 @@ def refine_fundamental(
             called or ``max_iterations`` is not a whole number.
         ShapeError: if a shape is wrong.
         ValueError: if there are fewer than eight correspondences, shapes do not pair up, a value is not finite, a
-            matrix is zero, there is no distance of that name, or ``max_iterations`` or ``tolerance`` is negative.
+            matrix is zero, ``distance`` is unknown, or ``max_iterations`` or ``tolerance`` is negative.
 
     Reference:
         A. Bartoli, P. Sturm, Nonlinear estimation of the fundamental matrix with minimal parameters, TPAMI 2004; R.
@@ -129,14 +129,14 @@ def refine_essential(
     max_iterations: int = 50,
     tolerance: float = 1e-7,
 ) -> EssentialRefinement:
-    r"""Refine essential matrices to a local minimum of a sum over the correspondences, by Levenberg-Marquardt.
+    r"""Refine essential matrices to a local minimum of a robust cost of the correspondences, by Levenberg-Marquardt.
 
     .. math:: \min_{E = U \mathrm{diag}(1, 1, 0) V^\top / \sqrt 2} \sum_i w_i\, \rho(d_i^2), \quad
               d_i \text{ the distance in pixels under } F = K_2^{-\top} E K_1^{-1}
 
-    over rotations :math:`U` and :math:`V`, which have five parameters in :math:`E`: those of a relative pose. The steps
-    are those of :func:`~kornia_learnnorm.refine_fundamental`, in float64. There are no gradients: the result carries
-    none. Use :func:`~kornia_learnnorm.refine_fundamental` where gradients are needed or the cameras are not known.
+    over rotations :math:`U` and :math:`V`, which give :math:`E` the five degrees of freedom of a relative pose. The
+    steps are those of :func:`~kornia_learnnorm.refine_fundamental`, in float64. The result carries no gradients: use
+    :func:`~kornia_learnnorm.refine_fundamental` if you need them or the cameras are unknown.
 
     Args:
         points1: pixels in the first image with shape :math:`(B, N, 2)` or :math:`(1, N, 2)`, :math:`N \ge 5`.
@@ -144,7 +144,7 @@ def refine_essential(
         E_mat: where to start, with shape :math:`(B, 3, 3)`, any scale but zero; the nearest essential matrix is taken.
         K1: cameras of the first images with shape :math:`(3, 3)` or :math:`(B, 3, 3)`.
         K2: cameras of the second images with shape :math:`(3, 3)` or :math:`(B, 3, 3)`.
-        weights: this and all that follow as for :func:`~kornia_learnnorm.refine_fundamental`.
+        weights: this and the next arguments as for :func:`~kornia_learnnorm.refine_fundamental`.
         loss: :math:`\rho` of squared distances.
         distance: the distance :math:`d`: ``"sampson"`` or ``"symmetric"``.
         max_iterations: largest number of steps tried.

@@ -1,7 +1,7 @@
 r"""Robust losses of squared distances.
 
-A loss returns its value and its derivative by the squared distance, which is the weight of iteratively reweighted least
-squares.
+A loss returns its value and its derivative with respect to the squared distance: the weight in iteratively reweighted
+least squares.
 """
 
 import math
@@ -42,7 +42,7 @@ class Huber(_RobustLoss):
     r"""Huber's loss of squared distances :math:`s`: :math:`s` up to :math:`c^2`, :math:`2 c \sqrt s - c^2` beyond.
 
     Args:
-        scale: :math:`c` in pixels, positive or it is a ValueError.
+        scale: :math:`c` in pixels; ValueError unless positive.
 
     Example:
         >>> Huber(1.0)(torch.tensor([0.25, 4.0]))
@@ -50,7 +50,7 @@ class Huber(_RobustLoss):
     """
 
     def __call__(self, squares: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the losses and their derivatives by the squared distances."""
+        """Return the losses and their derivatives with respect to the squared distances."""
         far = squares > self.scale**2
         distance = torch.where(far, squares, self.scale**2).sqrt()
         return torch.where(far, 2 * self.scale * distance - self.scale**2, squares), self.scale / distance
@@ -60,7 +60,7 @@ class Cauchy(_RobustLoss):
     r"""Cauchy's loss of squared distances :math:`s`: :math:`c^2 \log(1 + s / c^2)`.
 
     Args:
-        scale: :math:`c` in pixels, positive or it is a ValueError.
+        scale: :math:`c` in pixels; ValueError unless positive.
 
     Example:
         >>> Cauchy(2.0)(torch.tensor([0.0, 4.0]))
@@ -68,7 +68,7 @@ class Cauchy(_RobustLoss):
     """
 
     def __call__(self, squares: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the losses and their derivatives by the squared distances."""
+        """Return the losses and their derivatives with respect to the squared distances."""
         ratio = squares / self.scale**2
         return self.scale**2 * ratio.log1p(), 1 / (1 + ratio)
 
@@ -77,7 +77,7 @@ class GemanMcClure(_RobustLoss):
     r"""Geman and McClure's loss of squared distances :math:`s`: :math:`s / (1 + s / c^2)`, bounded by :math:`c^2`.
 
     Args:
-        scale: :math:`c` in pixels, positive or it is a ValueError.
+        scale: :math:`c` in pixels; ValueError unless positive.
 
     Example:
         >>> GemanMcClure(2.0)(torch.tensor([0.0, 4.0]))
@@ -85,7 +85,7 @@ class GemanMcClure(_RobustLoss):
     """
 
     def __call__(self, squares: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the losses and their derivatives by the squared distances."""
+        """Return the losses and their derivatives with respect to the squared distances."""
         weight = (1 + squares / self.scale**2).reciprocal()
         return squares * weight, weight.square()
 
@@ -94,7 +94,7 @@ class Truncated(_RobustLoss):
     r"""The truncated squares of MSAC: squared distances :math:`s` up to :math:`c^2`, and :math:`c^2` beyond.
 
     Args:
-        scale: :math:`c` in pixels, positive or it is a ValueError.
+        scale: :math:`c` in pixels; ValueError unless positive.
 
     Reference:
         P. Torr, A. Zisserman, MLESAC: a new robust estimator with application to estimating image geometry, CVIU 2000.
@@ -105,7 +105,7 @@ class Truncated(_RobustLoss):
     """
 
     def __call__(self, squares: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the losses and their derivatives by the squared distances."""
+        """Return the losses and their derivatives with respect to the squared distances."""
         return squares.clamp(max=self.scale**2), (squares <= self.scale**2).to(squares)
 
 

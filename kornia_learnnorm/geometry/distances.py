@@ -43,8 +43,8 @@ def symmetric_epipolar_distance(points1: Tensor, points2: Tensor, F_mat: Tensor)
         F_mat: fundamental matrices with shape :math:`(*, 3, 3)`, any scale.
 
     Returns:
-        distances in pixels with shape :math:`(*, N)`; infinite for a point on an epipole, up to rounding in float64:
-        there both the residual and the line's normal are what rounding leaves of zero.
+        distances in pixels with shape :math:`(*, N)`; infinite for a point on an epipole (up to rounding in float64),
+        where the residual and the normal of the epipolar line both vanish.
 
     Raises:
         TypeError: if an argument is not a floating-point tensor, or their dtypes differ.

@@ -14,9 +14,9 @@ from kornia_learnnorm.geometry.checks import check_mask, check_tensor, solve_dty
 def relative_pose(
     F_mat: Tensor, K1: Tensor, K2: Tensor, points1: Tensor, points2: Tensor, mask: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    r"""Return the pose of the second camera that a fundamental matrix and known cameras give.
+    r"""Return the relative pose, :math:`X_2 = R X_1 + t`, of a fundamental matrix and known cameras.
 
-    :math:`E = K_2^\top F K_1` has four poses; the one with most correspondences in front of both cameras is taken.
+    :math:`E = K_2^\top F K_1` has four poses; the one with most correspondences in front of both cameras is returned.
 
     Args:
         F_mat: fundamental matrices with shape :math:`(B, 3, 3)`, any scale.
@@ -24,14 +24,14 @@ def relative_pose(
         K2: cameras of the second images with shape :math:`(B, 3, 3)`.
         points1: pixels in the first images with shape :math:`(B, N, 2)`.
         points2: pixels in the second images with shape :math:`(B, N, 2)`.
-        mask: true for the correspondences that vote, inliers say, boolean with shape :math:`(B, N)`; default: all.
+        mask: true for the correspondences that vote, such as inliers, boolean with shape :math:`(B, N)`; default: all.
 
     Returns:
         rotations with shape :math:`(B, 3, 3)` and unit translations with shape :math:`(B, 3)`, solved in float64 where
         the device has it, in the dtype of ``F_mat``. Both are NaN where ``F_mat`` is not finite or of rank below two,
         or where two poses tie for the most votes.
 
-        Derivatives are those of a decomposition: NaN where E has two equal singular values, as an exact one has. Take
+        Do not backpropagate through it: gradients are NaN where E has two equal singular values, as an exact E has. Use
         :class:`~kornia_learnnorm.LearnedRelativePose` for a loss of the pose.
 
     Raises:

@@ -1,8 +1,8 @@
 r"""The rank-2 (singularity) constraint: projection in Frobenius norm, and optimal correction.
 
-The projection moves every entry of :math:`F` as if all were equally certain. They are not: the correspondences fix some
-combinations well and others hardly at all. The optimal correction moves :math:`F` along the uncertain ones, weighted by
-its covariance, so no normalisation has to choose a metric for it.
+The projection moves every entry of :math:`F` as if all were equally certain. But the correspondences determine some
+combinations of entries well and others hardly at all. The optimal correction moves :math:`F` along the uncertain ones,
+weighted by its covariance, so its metric does not depend on a normalisation.
 """
 
 import torch
