@@ -25,22 +25,22 @@ FORMAT = "kornia_learnnorm.normalizer.v1"
 class LearnedNormalizer(ProblemNormalizer):
     r"""Predict the transforms of the normalised eight-point algorithm from the correspondences.
 
-    :math:`T_i = B(p_i)\, T_i^{base}`: the base normaliser gives coordinates, the network reads the correspondences
-    there and predicts parameters :math:`p_i`, the builder :math:`B` makes a transform of them. With zero parameters
-    the transforms are exactly the base's.
+    :math:`T_i = B(p_i)\, T_i^{base}`: the network reads the correspondences in the coordinates of the base normaliser
+    and predicts parameters :math:`p_i`, from which the builder :math:`B` makes a transform. Zero parameters give
+    exactly the transforms of the base.
 
     Args:
-        base: normaliser ``(points1, points2, weights) -> (T1, T2)``; :class:`~kornia_learnnorm.ReweightedWhitening`
-            when not given, as in the shipped weights ``crossview``.
+        base: normaliser ``(points1, points2, weights) -> (T1, T2)``; default
+            :class:`~kornia_learnnorm.ReweightedWhitening`, as in the shipped weights ``crossview``.
         network: ``(points1, points2, weights) -> (params1, params2)`` in base coordinates, also given the DLT's
-            ``null_matrix`` there if its attribute ``needs_null_matrix`` is true; an untrained
-            :class:`~kornia_learnnorm.CrossViewNetwork` of their size when not given.
+            ``null_matrix`` there if its attribute ``needs_null_matrix`` is true; default: an untrained
+            :class:`~kornia_learnnorm.CrossViewNetwork` of the size of ``crossview``.
         transform: builder from parameters :math:`(B, P)` to transforms :math:`(B, 3, 3)`.
         max_points: sets of more correspondences get Hartley's transforms; None for no limit. It is 12 in ``crossview``.
 
     Attributes:
         trained_on: names of the stores that the weights were trained on, ``STORE@FIRST:STOP`` for some pairs of one, or
-            ``synthetic scenes``; empty where that is not known. It is saved with the weights.
+            ``synthetic scenes``; empty if unknown. It is saved with the weights.
 
     Reference:
         Fan et al., section 4.
@@ -125,8 +125,8 @@ class LearnedNormalizer(ProblemNormalizer):
         Args:
             name: ``"crossview"`` or ``"crossview-synthetic"``, for up to twelve correspondences; ``"crossview-sets"``,
                 for more; ``"paper"``; or the path of a ``.safetensors`` file.
-            own_modules: names of modules of your own that the file may name and that are then imported, from the Python
-                path or the working folder. Without, no code but this package's runs.
+            own_modules: names of your own modules that the file may name; they are imported from the Python path or the
+                working folder. By default only this package's code runs.
 
         Raises:
             FileNotFoundError: if there are no such weights; the message lists those that ship.

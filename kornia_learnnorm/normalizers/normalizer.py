@@ -1,9 +1,9 @@
-r"""The contract of a normaliser, and how the solver calls one.
+r"""The signature of a normaliser, and how the solver calls one.
 
-A normaliser is any callable ``(points1, points2, weights=None) -> (T1, T2)``: pixels :math:`(B, N, 2)` of both views
-and optional weights :math:`(B, N)` go in, two transforms :math:`(B, 3, 3)` come out. It may also offer
-``transforms(problem)``, which takes a solved :class:`~kornia_learnnorm.geometry.problem.LinearProblem` instead, so that
-nothing is checked or solved twice. :class:`ProblemNormalizer` turns that method into the contract.
+A normaliser is any callable ``(points1, points2, weights=None) -> (T1, T2)``. It takes pixels :math:`(B, N, 2)` of both
+views and optional weights :math:`(B, N)`, and returns two transforms :math:`(B, 3, 3)`. It may also have a method
+``transforms(problem)``, which takes a solved :class:`~kornia_learnnorm.geometry.problem.LinearProblem`, so that nothing
+is checked or solved twice. :class:`ProblemNormalizer` implements the signature by this method.
 """
 
 from collections.abc import Callable
@@ -50,7 +50,7 @@ class ProblemNormalizer(nn.Module):
 
 
 class PerView(nn.Module):
-    """Adapt a per-view callable, such as ``kornia.geometry.epipolar.normalize_points``, to the contract.
+    """Make a normaliser of a per-view callable, such as ``kornia.geometry.epipolar.normalize_points``.
 
     Args:
         normalize: maps points :math:`(B, N, 2)` (and ``weights=``, where weights are given) to a pair whose second
@@ -68,7 +68,7 @@ class PerView(nn.Module):
         self.normalize = normalize
 
     def forward(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return the callable's transforms of both views; points are handed on unchecked."""
+        """Return the callable's transforms of both views; points are not checked."""
         kwargs = {} if weights is None else {"weights": weights}
         return self.normalize(points1, **kwargs)[1], self.normalize(points2, **kwargs)[1]
 
@@ -81,7 +81,7 @@ def check_normalizer(normalizer: object) -> None:
 
 
 def transforms_of(normalizer: Normalizer, problem: LinearProblem) -> tuple[Tensor, Tensor]:
-    """Call a normaliser on a problem: its method ``transforms`` where it has one, else the contract."""
+    """Return the transforms of a problem: by a normaliser's method ``transforms``, or by a call if it has none."""
     check_normalizer(normalizer)
     if hasattr(normalizer, "transforms"):
         found: tuple[Tensor, Tensor] = normalizer.transforms(problem)

@@ -33,8 +33,8 @@ class ReweightedWhitening(ProblemNormalizer):
     to the symmetric epipolar distance (Fan et al., Eq. 7). Each iteration finds the lines :math:`a, b` of the rank-2
     correction, :math:`b \propto S_1^{-1} F_0^{-1} a` and :math:`a \propto S_2^{-1} F_0^{-\top} b`, and sets the weights
     of view 1 to :math:`w_i |a^\top x_{2,i}| / |b^\top x_{1,i}|`, of view 2 to its mirror image: iteratively reweighted
-    least squares for the sum of absolute residuals. The views take turns together, not one after the other, so that
-    swapping them swaps the transforms.
+    least squares for the sum of absolute residuals. Both views are updated at the same time, so that swapping them
+    swaps the transforms.
 
     Args:
         iterations: number of reweightings; 0 whitens with :math:`w`. ValueError for a negative number.

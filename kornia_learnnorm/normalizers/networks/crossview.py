@@ -30,17 +30,18 @@ _FEATURES = {"own": (2, 1), "both": (4, 1), "epipolar": (13, 10)}  # their numbe
 class CrossViewNetwork(nn.Module):
     r"""Predict each view's parameters from the correspondences of both and from the null vector of the DLT.
 
-    View 1 sees the problem as it is, view 2 its mirror image (views swapped, :math:`F` transposed), so that swapping
-    the views swaps the outputs exactly. A correspondence enters as its two points, the directions and norms of its two
-    epipolar lines, its distances from the lines of the rank-2 correction and the epipolar distance that this leaves it;
-    the set enters with :math:`F` and the size of the correction. An untrained network is the base.
+    The network runs for view 1 on the problem as it is, and for view 2 on its mirror image (views swapped, :math:`F`
+    transposed), so that swapping the views swaps the outputs exactly. Its inputs for each correspondence are both
+    points, the directions and norms of both epipolar lines, the distances from the lines of the rank-2 correction and
+    the epipolar distance after it; for the set, :math:`F` and the size of the correction. An untrained network predicts
+    zero: the transforms of the base.
 
     Args:
         width: channels.
         depth: residual layers.
         num_parameters: parameters per view, as the transform builder wants them.
-        bound: the parameters stay within plus and minus this.
-        features: what a view's pass sees, to compare: ``"epipolar"`` all of the above, ``"both"`` only the points of
+        bound: largest magnitude of a parameter.
+        features: inputs of a view's pass, for ablations: ``"epipolar"`` all of the above, ``"both"`` only the points of
             both views, ``"own"`` only its own points; ValueError for others.
 
     Example:

@@ -16,11 +16,12 @@ class PaperNetwork(nn.Module):
 
     A linear layer shared by the points, residual blocks with instance normalisation over the points, the maximum over
     the points before the first block and after each, a convolution over the stack of these maxima, and two fully
-    connected layers. Both views share all weights. Any number of points from two on goes in, in any order.
+    connected layers. Both views share all weights. It takes two or more points, in any order.
 
     Where the text leaves a choice: the first layer has no activation; a block is twice a linear layer, instance
     normalisation and ReLU, plus the skip; no normalisation has parameters of its own; each maximum is normalised over
-    its channels; the convolution is not padded; the last layer starts at zero, so an untrained network is the base.
+    its channels; the convolution is not padded; the last layer starts at zero, so an untrained network gives the
+    transforms of the base.
 
     Args:
         width: channels of a point, 128 in the paper.
