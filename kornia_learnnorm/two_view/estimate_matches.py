@@ -1,4 +1,4 @@
-"""The fundamental matrix or homography of matches, with its predicted error and the reasons to doubt it."""
+"""The fundamental matrix or homography of matches, with its predicted error and warnings."""
 
 import math
 from typing import Any, cast
@@ -56,31 +56,31 @@ def estimate_matches(
     K2: Points | None = None,
     model: str = "auto",
 ) -> PairEstimate:
-    """Return the fundamental matrix or homography of matches with its predicted error and the reasons to doubt it.
+    """Return the fundamental matrix or homography of matches, with cameras the pose, a predicted error and warnings.
 
-    The answer is a homography where the matches do not determine a fundamental matrix, as on a plane or where the
-    camera only rotates, see :func:`~kornia_learnnorm.two_view.model_choice.choose_model`. Where less than half of the
-    matches are inliers, RANSAC searches again among those near its matrix. Where one homography explains most inliers,
-    the matrix of this homography and the parallax of the other matches is tried too.
+    The result is a homography if the matches do not determine a fundamental matrix, as on a plane or when the camera
+    only rotates, see :func:`~kornia_learnnorm.two_view.model_choice.choose_model`. If less than half of the matches are
+    inliers, RANSAC searches again among those near its matrix. If one homography explains most inliers, the fundamental
+    matrix from this homography and the parallax of the other matches is tried as well.
 
     Args:
         points1: pixels in image 1 with shape (N, 2), an array or a tensor of numbers. Rows that are not finite, or more
             than 1e6 median distances from the other points, are left out.
         points2: pixels in image 2 with shape (N, 2).
-        scores: from 0 to 1 with shape (N,), 1 minus Lowe's ratio or a matcher's confidence; all equal when not given.
-        size1: width and height of image 1, pixels, or LightGlue's ``image_size[0]``; as large as its points need when
-            not given.
+        scores: from 0 to 1 with shape (N,), 1 minus Lowe's ratio or a matcher's confidence; default: all equal.
+        size1: width and height of image 1, pixels, or LightGlue's ``image_size[0]``; default: the smallest that holds
+            the points.
         size2: width and height of image 2.
-        layer: estimates the fundamental matrix in the place of RANSAC.
-        threshold: RANSAC's threshold, and the largest distance of an inlier, pixels: the symmetric epipolar distance,
-            or that of its point in image 2 from where the homography moves that in image 1.
-        seed: seed of RANSAC and of the parts of the matches.
+        layer: estimates the fundamental matrix instead of RANSAC.
+        threshold: RANSAC's threshold and the largest distance of an inlier, pixels: the symmetric epipolar distance, or
+            for a homography the distance in image 2.
+        seed: seed of RANSAC and of the random subsets of the matches.
         K1: camera of image 1, (3, 3), in pixels.
         K2: camera of image 2; both or none.
         model: ``"auto"``, ``"fundamental"`` or ``"homography"``.
 
     Returns:
-        the estimate; its matches are the given ones, ``rows`` says which, but for those left out, those that share a
+        the estimate. Its matches are the given ones at the indices ``rows``: without those left out, those that share a
         point with one of a higher score, and those that do not move at all, as on an overlay.
 
     Raises:

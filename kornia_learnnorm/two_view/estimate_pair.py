@@ -48,25 +48,26 @@ def estimate_pair(
     model: str = "auto",
     refiner: MatchRefiner | None = None,
 ) -> PairEstimate:
-    """Return the fundamental matrix or homography of two images with its predicted error and the reasons to doubt it.
+    """Return the fundamental matrix or homography of two images, with cameras the pose, a predicted error and warnings.
 
-    Matches are nearest neighbours in both directions that pass the ratio test in both, with 1 minus the larger ratio as
+    Matches are mutual nearest neighbours that pass the ratio test in both directions, with 1 minus the larger ratio as
     score, or LightGlue's with its scores; :func:`~kornia_learnnorm.estimate_matches` estimates the matrix. Features on
-    a constant black frame around an image are dropped. Where texture repeats, matches that do not move like those
-    around them are left out. The predicted error is too small there.
+    a constant black frame around an image are dropped. Where texture repeats, matches that do not move like their
+    neighbours are left out, and the predicted error is too small.
 
     Args:
         image1: file of image 1, or its values: grey with shape (H, W) or RGB with shape (H, W, 3), uint8.
         image2: file of image 2, or its values.
-        layer: estimates the fundamental matrix in the place of RANSAC.
+        layer: estimates the fundamental matrix instead of RANSAC.
         ratio: largest ratio of the nearest to the second-nearest descriptor distance, of the matcher ``nearest``.
         threshold: RANSAC's threshold and the largest distance of an inlier, pixels of the images as they are matched.
-        seed: seed of RANSAC and of the parts of the matches; equal images and seeds give equal estimates.
+        seed: seed of RANSAC and of the random subsets of the matches; equal images and seeds give equal estimates.
         K1: camera of image 1, (3, 3), pixels of the full image; with both, the result has an essential matrix and pose.
         K2: camera of image 2; both or none.
-        mask1: true for the pixels of image 1 whose features count, (H, W) bool.
-        mask2: the same of image 2.
-        max_size: images with a longer side are matched reduced to it; points and F are those of the full images.
+        mask1: true for the pixels of image 1 whose features are used, (H, W) bool.
+        mask2: mask of image 2.
+        max_size: longest side at which images are matched, pixels; larger images are reduced, but points and matrices
+            are those of the full images.
         detector: a key of ``kornia_learnnorm.data.matching.features.DETECTORS``.
         matcher: one of ``kornia_learnnorm.data.matching.matchers.MATCHERS``.
         model: ``"auto"``, ``"fundamental"`` or ``"homography"``.

@@ -17,7 +17,7 @@ CONVENTION = "x2^T F x1 = 0, x2 ~ H x1, x = (column, row, 1) in pixels, X2 = R X
 
 
 class NoReliableMatrixError(ValueError):
-    """The images or matches do not determine a matrix; ``code`` is one word for programs."""
+    """Raised if the images or matches do not determine a matrix; ``code`` is the reason in one word."""
 
     def __init__(self, code: str, text: str) -> None:
         super().__init__(text)
@@ -25,7 +25,7 @@ class NoReliableMatrixError(ValueError):
 
 
 class ModelChoice(NamedTuple):
-    """Which matrix is the answer, and the numbers that decided; None where a matrix was not sought or not found."""
+    """The model of the result, and the numbers that decided; None where a matrix was not sought or not found."""
 
     model: str  # "fundamental" or "homography"
     reason: str  # one sentence for people
@@ -54,13 +54,13 @@ class PairEstimate:
     choice: ModelChoice
     F_mat: Tensor | None  # (3, 3), float64, unit Frobenius norm, x2^T F x1 = 0 in pixels; None where none was found
     H_mat: Tensor | None  # (3, 3), float64, unit Frobenius norm, x2 ~ H x1 in pixels; None where none was found
-    estimator: str  # what made the matrix: "RANSAC" or "LearnedEightPoint"
+    estimator: str  # name of the estimator: "RANSAC" or "LearnedEightPoint"
     points1: Tensor  # pixels of the matches in image 1, (N, 2), float64
     points2: Tensor  # pixels of the matches in image 2, (N, 2), float64
     scores: Tensor  # of each match, 1 minus its ratio or the matcher's score, (N,), float64
     weights: Tensor  # probability of each match to be an inlier as the estimator sees it, (N,), float64
     inliers: Tensor  # mask of the matches with a distance to the matrix below the threshold, (N,), bool
-    predicted_error: float  # median distance of exact correspondences to the matrix that is expected, pixels
+    predicted_error: float  # expected median distance of exact correspondences under the matrix, pixels
     warnings: tuple[PairWarning, ...]  # reasons to doubt the matrix; empty when all is well
     size1: tuple[int, int]  # width and height of image 1
     size2: tuple[int, int]  # width and height of image 2
@@ -71,11 +71,11 @@ class PairEstimate:
     path2: Path | None = None
     E_mat: Tensor | None = None  # (3, 3), nearest to K2^T F K1, unit norm; None without cameras or translation
     R: Tensor | None = None  # rotation (3, 3) of X2 = R X1 + t; None without cameras, and where two poses tie
-    t: Tensor | None = None  # direction of translation (3,); None without cameras, and where the camera only turned
+    t: Tensor | None = None  # direction of translation (3,); None without cameras, and where the camera only rotates
     front: Tensor | None = None  # mask of the matches in front of both cameras, (N,), bool; None without cameras
     n: Tensor | None = None  # unit normal (3,) of the plane, n^T X1 > 0; None without cameras or a plane
-    other_pose: PlanePose | None = None  # second pose and normal that the plane allows; None where there is one alone
-    rows: Tensor | None = None  # place of each match among those given to estimate_matches, (N,); None of two images
+    other_pose: PlanePose | None = None  # second pose and normal that the plane allows; None if there is only one
+    rows: Tensor | None = None  # index of each match among those given to estimate_matches, (N,); None of two images
 
     def __str__(self) -> str:
         """Return :meth:`summary`."""
@@ -83,12 +83,12 @@ class PairEstimate:
 
     @property
     def model(self) -> str:
-        """Name of the answer: ``fundamental`` or ``homography``."""
+        """Name of the model: ``fundamental`` or ``homography``."""
         return self.choice.model
 
     @property
     def matrix(self) -> Tensor:
-        """The answer, (3, 3): ``H_mat`` or ``F_mat``."""
+        """The matrix of ``model``, (3, 3): ``F_mat`` or ``H_mat``."""
         return cast(Tensor, self.H_mat if self.model == "homography" else self.F_mat)
 
     @property
@@ -108,7 +108,7 @@ class PairEstimate:
         return median(distance(self.points1[self.inliers], self.points2[self.inliers], self.matrix)).item()
 
     def as_dict(self, matches: bool = True) -> dict[str, Any]:
-        """Return all of it, or all but what each match has, as what JSON can hold."""
+        """Return all fields, or all but those of each match, as values for JSON."""
 
         def view(path: Path | None, size: tuple[int, int]) -> dict[str, Any]:
             return {"file": None if path is None else str(path), "width": size[0], "height": size[1]}
