@@ -73,7 +73,7 @@ class HubModel(nn.Module, PyTorchModelHubMixin, library_name="kornia_learnnorm",
         return self.layer(*args, **kwargs)
 
     def generate_model_card(self, *args: Any, **kwargs: Any) -> ModelCard:
-        """Return the model card; ``model_card_kwargs`` of the mixin's methods replace its words."""
+        """Return the model card; ``model_card_kwargs`` of the mixin's methods override its values."""
         names = ", ".join(self.layer.trained_on) or "not known"
         words = {"class_name": type(self.layer).__name__, "trained_on": names}
         return super().generate_model_card(*args, **{**words, **kwargs})

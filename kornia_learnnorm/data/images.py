@@ -54,7 +54,7 @@ def check_grey(image: NDArray[np.uint8], colour: bool = False) -> None:
 
 
 def read_image(path: str | Path, max_size: int | None = None) -> NDArray[np.uint8]:
-    """Return the grey values :math:`(H, W)`, uint8, of an image file, turned as its EXIF orientation says.
+    """Return the grey values :math:`(H, W)`, uint8, of an image file, rotated by its EXIF orientation.
 
     They are those of OpenCV's ``IMREAD_GRAYSCALE``, up to a level higher in other formats than PNG and JPEG (two for
     CMYK). Of an animation the first image is read; transparency is over black.
@@ -127,7 +127,7 @@ def _orientation(image: Any) -> int:
 
 
 def stored_pixels(path: Path, points: Array, size: Sequence[int], turned: bool = True) -> tuple[Array, Size]:
-    """Return pixels (N, 2) and the (width, height) of an image, ``turned`` by EXIF or not, in the file as stored."""
+    """Return pixels (N, 2) and the (width, height) of an image, rotated by EXIF (``turned``) or not, in the file."""
     turn = 1
     if turned:
         if image_size(path) == (0, 0):
@@ -160,7 +160,7 @@ def open_image(path: Path) -> Iterator[Any]:
 
 
 def image_size(path: str | Path) -> Size:
-    """Return (width, height) of an image from its header, turned by EXIF; (0, 0) where it cannot be read."""
+    """Return (width, height) of an image from its header, after EXIF rotation; (0, 0) if it cannot be read."""
     import_pillow()  # outside of the try block, which would hide that it is missing
     path = Path(path)
     if not path.is_file():
@@ -206,7 +206,7 @@ def scaling(size_from: Size, size_to: Size) -> Tensor:
 def read_mask(path: str | Path, size: Size) -> NDArray[np.bool_]:
     """Return which pixels of an image count by a mask file, (H, W) bool: those above 127, not transparent.
 
-    A mask without a pixel that counts, or without the (width, height) of the image file, turned by EXIF, is a
+    A mask without a pixel that counts, or without the (width, height) of the image file after EXIF rotation, is a
     ValueError.
     """
     mask = read_image(path) >= MIN_USED

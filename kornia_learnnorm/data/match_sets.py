@@ -1,4 +1,4 @@
-"""Sets of correspondences of image pairs: samples of eight, or matches with outliers, and what supervises them."""
+"""Sets of correspondences of image pairs: samples of eight, or matches with outliers, with their supervision."""
 
 from typing import Any, NamedTuple, Self
 

@@ -19,7 +19,7 @@ from kornia_learnnorm.models.homography import Homography
 
 
 class HomographyStage(NamedTuple):
-    """What one stage gives."""
+    """Result of one stage."""
 
     H_mat: Tensor  # homographies of unit Frobenius norm, (B, 3, 3)
     logits: Tensor  # of the probabilities that the correspondences are inliers, (B, N)

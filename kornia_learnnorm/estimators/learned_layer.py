@@ -1,4 +1,4 @@
-"""What the learned layers share: networks weigh the correspondences and choose the transforms of a DLT, in stages."""
+"""Base class of the learned layers: networks predict weights and transforms of a DLT, in stages."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ MIN_JUDGED = 16  # matches of a set whose distances tell inliers: a matrix fits 
 
 
 class StageEstimate(NamedTuple):
-    """What one stage gives."""
+    """Result of one stage."""
 
     F_mat: Tensor  # fundamental matrices of rank 2 and unit Frobenius norm, (B, 3, 3)
     logits: Tensor  # of the probabilities that the correspondences are inliers, (B, N)
 
 
 class LearnedLayer(MatchLayer):
-    """Networks weigh the correspondences and choose the transforms of a model's DLT, in stages.
+    """Base class of the learned layers: networks predict weights and transforms of a model's DLT, in stages.
 
     Arguments, attributes and errors are those of :class:`LearnedEightPoint`; ``model`` says what the matrix is.
     """
@@ -118,7 +118,7 @@ class LearnedLayer(MatchLayer):
         return layer
 
     def start_from(self, layer: LearnedLayer) -> Self:
-        """Load the first networks of an estimator of fundamental matrices; what only the own ones read is zero."""
+        """Load the first networks of an estimator of fundamental matrices; weights of additional inputs are zero."""
         columns = torch.tensor([*range(POINT_FEATURES), *range(self.features, self.features + RESIDUAL_FEATURES)])
         for own, other in zip(self.networks, layer.networks, strict=False):
             state = {k: v for k, v in other.state_dict().items() if not k.startswith("head.2.")}

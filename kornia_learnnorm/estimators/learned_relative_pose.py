@@ -28,7 +28,7 @@ from kornia_learnnorm.models.fundamental import Fundamental
 
 
 class PoseStage(NamedTuple):
-    """What one stage gives."""
+    """Result of one stage."""
 
     E_mat: Tensor  # essential matrices of unit Frobenius norm, (B, 3, 3)
     logits: Tensor  # of the probabilities that the correspondences are inliers, (B, N)

@@ -86,7 +86,7 @@ def _inference_mode(normalizer: Normalizer | None) -> AbstractContextManager[obj
 
 
 def solve_linear(problem: LinearProblem, normalizer: Normalizer | None) -> Tensor:
-    """Return the matrices of a problem in the coordinates of a normaliser; None for Hartley's, in which it comes."""
+    """Return the matrices of a problem, solved in the coordinates of a normaliser; None for Hartley's."""
     if normalizer is None or isinstance(normalizer, Hartley) or not problem.model.needs_transforms(problem):
         return solve_in_coordinates(problem, problem.T1, problem.T2)
     return solve_in_coordinates(problem, *normalizing_transforms(normalizer, problem))

@@ -1,4 +1,4 @@
-r"""Correspondences from the output of matching networks: matches by index, one padded batch."""
+r"""Padded batches of correspondences from the output of matching networks."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, NoReturn
@@ -71,7 +71,7 @@ def correspondences_from_matches(
 
 
 class MatchLayer(nn.Module):
-    """What all layers have in common: they take the output of matching networks, and refuse ``torch.jit``."""
+    """Base class of all layers: takes the output of matching networks, refuses ``torch.jit``."""
 
     scores_are = "weights"  # what the scores of matches are to `estimate`, "weights" or "scores"
     takes_cameras = True
@@ -86,27 +86,27 @@ class MatchLayer(nn.Module):
         K1: Tensor | None = None,
         K2: Tensor | None = None,
     ) -> Any:
-        """Return the estimate of the matches of a matching network, whose scores get gradients.
+        """Return the estimate from the output of a matching network, whose scores get gradients.
 
         Args:
-            keypoints1: pixels in the first view with shape :math:`(B, M_1, 2)`, or a mapping with ``"keypoints"``, as
-                LightGlue takes; without a batch too there, as its ``rbd`` leaves them.
+            keypoints1: pixels in the first view with shape :math:`(B, M_1, 2)`, or LightGlue's input, a mapping with
+                ``"keypoints"``, of a batch or, after ``rbd``, of one pair.
             keypoints2: pixels in the second view with shape :math:`(B, M_2, 2)`, or such a mapping.
             matches: a list of B tensors :math:`(S_i, 2)` of index pairs, as Kornia's LightGlue returns; or one tensor
                 :math:`(B, S, 2)` of pairs, negative for no match; or one tensor
                 :math:`(B, M_1)` with the index of the match of each keypoint of view 1, negative for no match, as
                 SuperGlue and Transformers (``matches[:, 0]``) return; or LightGlue's output, a mapping with
                 ``"matches"`` and ``"scores"`` or ``"matches0"`` and ``"matching_scores0"``, of a batch or of one pair.
-            scores: optional, non-negative, of a learned layer from 0 to 1: a list of B tensors :math:`(S_i,)`, or one
-                tensor :math:`(B, S)` or :math:`(B, M_1)`; those of a mapping come with it.
+            scores: optional, non-negative, for learned layers from 0 to 1: a list of B tensors :math:`(S_i,)`, or one
+                tensor :math:`(B, S)` or :math:`(B, M_1)`; leave it out if ``matches`` is a mapping, which has them.
             K1: optional cameras of the first view, as for :meth:`estimate`.
             K2: optional cameras of the second view.
 
         Returns:
-            the estimate; pairs with fewer matches than the matrix needs (fundamental: eight) are not determined.
+            the estimate; ``determined`` is false for pairs with too few matches (fundamental: eight).
 
         Raises:
-            TypeError: if keypoints, matches or scores are no tensors, matches no integers or scores not floating-point.
+            TypeError: if keypoints, matches or scores are not tensors, matches not integers, or scores not floats.
             ShapeError: if the keypoints do not have the shape above.
             ValueError: if the matches do not fit the keypoints, or the scores not the matches, or as :meth:`estimate`.
         """

@@ -1,4 +1,4 @@
-r"""The per-sample optimum of the normalisation: how far any normaliser could go on a sample's own points."""
+r"""The per-sample optimum of the normalisation: how small a normaliser can make the residual of a sample."""
 
 import torch
 from torch import Tensor, nn

@@ -47,7 +47,7 @@ def design_matrix(x1: Tensor, x2: Tensor) -> Tensor:
 def solve_rows(
     A: Tensor, weights: Tensor | None = None, product: Callable[[Tensor], Tensor] | None = None
 ) -> tuple[Tensor, Tensor]:
-    r"""Return the null vectors :math:`(*, 9)` of design matrices :math:`(*, N, 9)`, and how unique they are.
+    r"""Return the null vectors :math:`(*, 9)` of design matrices :math:`(*, N, 9)`, and their relative gaps.
 
     They are the unit vectors :math:`h` of least :math:`\sum_i w_i (A_i h)^2`, of any sign. Eight rows have exact ones,
     whatever the positive weights; their relative gap, from 0 to 1, is the smallest pivot over the largest of the LU

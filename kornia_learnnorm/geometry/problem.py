@@ -61,7 +61,7 @@ class LinearProblem:
 
     @property
     def gap(self) -> Tensor:
-        """Relative gap that tells how well the points determine the null matrix, (B,); see ``dlt.solve_rows``."""
+        """Relative gap: how well the points determine the null matrix, (B,); see ``dlt.solve_rows``."""
         return self.solve()[1]
 
     @property
@@ -142,7 +142,7 @@ def solve_where_determined(
     solve: Callable[[LinearProblem, Tensor | None], tuple[Tensor, ...]],
     solve_undetermined: Callable[[LinearProblem], tuple[Tensor, ...]],
 ) -> tuple[Tensor, ...]:
-    """Return the solutions of sets of correspondences that determine their matrix, and other ones of those that don't.
+    """Return the solutions of sets of correspondences, and placeholders for those that do not determine their matrix.
 
     ``solve`` returns tensors (B', ...) of a problem and the indices of its sets, None for all; ``solve_undetermined``
     the same tensors of a problem that does not determine its matrices.

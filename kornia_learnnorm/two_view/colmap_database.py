@@ -95,7 +95,7 @@ def export_colmap(
         layer: estimates the fundamental matrix in the place of RANSAC.
         threshold: RANSAC's largest symmetric epipolar distance, pixels; inliers are the matches within twice of it.
         seed: seed of RANSAC.
-        turned: whether the points are those of images turned by EXIF, as a store has them, or of the files as they are,
+        turned: whether the points are those of images rotated by EXIF, as a store has them, or of the stored files,
             as hloc and COLMAP read them.
         jobs: number of processes, -1 for one a core.
 

@@ -1,4 +1,4 @@
-"""Estimates of many image pairs, one JSON line each; a run that was stopped continues where it was."""
+"""Estimates of many image pairs, one JSON line each; an interrupted run continues."""
 
 import csv
 import json

@@ -53,7 +53,7 @@ class Parallax(NamedTuple):
 
     @property
     def planar(self) -> bool:
-        """Whether the scene is a plane or the camera only turned: the matches do not determine F."""
+        """Whether the scene is a plane or the camera only rotates, so that the matches do not determine F."""
         return self.wide > MIN_PLANAR_SHARE and self.log_chance > MAX_LOG_CHANCE_PARALLAX
 
     def describe(self, threshold: float) -> str:

@@ -1,7 +1,7 @@
 r"""The poses of two calibrated cameras that a homography allows: those of a plane, or a rotation.
 
 In normalised coordinates the homography of the plane :math:`n^\top X_1 = d` is :math:`R + t n^\top / d` up to scale,
-:math:`R` where the camera only turned.
+:math:`R` where the camera only rotates.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ MIN_IN_FRONT = 0.95  # of the points, under a pose that they allow
 
 
 class PlanePose(NamedTuple):
-    """A pose :math:`X_2 = R X_1 + t` and the plane that is seen; without t and n where the camera only turned."""
+    """A pose :math:`X_2 = R X_1 + t` and the plane that is seen; without t and n where the camera only rotates."""
 
     R: Tensor  # (3, 3)
     t: Tensor | None = None  # unit vector (3,)
@@ -41,8 +41,8 @@ class PlanePose(NamedTuple):
 def plane_poses(H_mat: Tensor, K1: Tensor, K2: Tensor, points1: Tensor, points2: Tensor) -> list[PlanePose]:
     """Return the poses of a homography (3, 3) that matches (N, 2) allow: two or one of a plane, or the rotation.
 
-    A plane has two poses unless points would be behind a camera, none if the homography turns it over. With a baseline
-    below 1 % of the distance to the plane the camera only turned. All are in float64, points in pixels.
+    A plane has two poses unless points would be behind a camera, none if the homography turns it over. A baseline
+    below 1 % of the distance to the plane counts as a rotation. All are in float64, points in pixels.
 
     Reference:
         E. Malis, M. Vargas, Deeper understanding of the homography decomposition for vision-based control, INRIA

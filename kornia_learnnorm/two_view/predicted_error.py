@@ -1,4 +1,4 @@
-"""How far a matrix may be off, from those of random parts of the matches."""
+"""The predicted error of a matrix, from the matrices of random subsets of the matches."""
 
 import math
 from typing import NamedTuple
@@ -33,7 +33,7 @@ class PredictedError(NamedTuple):
 
 
 def random_parts(number: int, inliers: int, seed: int) -> Tensor:
-    """Return the rows (P, M) of random parts of the matches: half of them, or so many that 48 inliers are expected."""
+    """Return the rows (P, M) of random subsets: half of the matches, or so many that 48 inliers are expected."""
     share = min(max(0.5, PART_INLIERS / max(1, inliers)), 0.8)
     size = min(max(8, round(share * number)), number - 1)
     generator = torch.Generator().manual_seed(seed)
@@ -49,7 +49,7 @@ def drop_failed_parts(F_parts: Tensor, support: Tensor, inliers: int) -> Tensor:
 def predict_error(
     F_parts: Tensor, size: int, points1: Tensor, points2: Tensor, F_mat: Tensor, inliers: Tensor, K1: Tensor, K2: Tensor
 ) -> PredictedError:
-    """Return the standard errors of ``F_mat`` from its distance to the matrices of random parts of the matches.
+    """Return the standard errors of ``F_mat`` from its distance to the matrices of random subsets of the matches.
 
     A part of m of N matches, drawn without replacement, differs from all of them with N / m - 1 times the variance of
     the latter (delete-d jackknife: J. Shao, C. Wu, A general theory for jackknife variance estimation, Annals of

@@ -1,4 +1,4 @@
-"""Matching all pairs of frames into a store, on all cores or on many machines, with features on disk meanwhile."""
+"""Matching all pairs of frames into a store, on all cores or many machines; features are kept on disk."""
 
 import sys
 from collections import Counter
@@ -98,7 +98,7 @@ def collect_matches(
     jobs: int = 1,
     dask: str | None = None,
 ) -> dict[str, str]:
-    """Match all pairs into a store, with a progress bar; a run that was stopped continues where it was.
+    """Match all pairs into a store, with a progress bar; an interrupted run continues.
 
     Until the store is complete, its pairs are in ``<path>.parts``. ``about`` gives its ``dataset`` and ``pairs``,
     ``jobs`` is a number of processes on this machine, -1 for one a core, and ``dask`` the address of a scheduler whose

@@ -54,7 +54,7 @@ class Plane(NamedTuple):
 def render_pair(seed: int = 0, width: int = 640, height: int = 480) -> RenderedPair:
     """Render two views of a room with pictures on stands; equal seeds give equal images.
 
-    The second camera is about half a metre to the side of and ahead of the first one and turned a little. A seed below
+    The second camera is about half a metre to the side of and ahead of the first one and rotated a little. A seed below
     0 and a height below 64 pixels or above the width are a ValueError.
     """
     check_size(seed, width, height)
