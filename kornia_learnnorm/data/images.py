@@ -152,11 +152,9 @@ def _reduce(image: Any, size: Size, box: tuple[float, float, float, float] | Non
 @contextmanager
 def open_image(path: Path) -> Iterator[Any]:
     """Open an image without Pillow's warnings about large images and odd metadata."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        # an open file, not the path: Pillow 13 maps an uncompressed TIFF into memory and then turns it wrongly
-        with path.open("rb") as file, import_pillow().open(file) as image:
-            yield image
+    # an open file, not the path: Pillow 13 maps an uncompressed TIFF into memory and then turns it wrongly
+    with warnings.catch_warnings(action="ignore"), path.open("rb") as file, import_pillow().open(file) as image:
+        yield image
 
 
 def image_size(path: str | Path) -> Size:

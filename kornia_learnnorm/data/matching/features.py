@@ -149,8 +149,8 @@ class _ErrorsOnly(StringIO):
 def pretrained(name: str, load: Callable[..., Any], *args: Any) -> Any:
     """Return the network of Kornia that ``load(*args)`` makes; MissingWeightsError if its weights cannot be loaded."""
     try:
-        with warnings.catch_warnings(), redirect_stderr(_ErrorsOnly()):
-            warnings.simplefilter("ignore", UserWarning)  # one for each attempt to download
+        # a warning for each attempt to download
+        with warnings.catch_warnings(action="ignore", category=UserWarning), redirect_stderr(_ErrorsOnly()):
             return load(*args)
     except (OSError, RuntimeError, EOFError, UnpicklingError) as error:  # the last two: a truncated file in the cache
         get = "run the command once with access to the internet, or save the file of the address as the path"

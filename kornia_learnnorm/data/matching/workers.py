@@ -28,8 +28,7 @@ class Workers:
         try:
             yield results
         finally:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # about cancelled tasks
+            with warnings.catch_warnings(action="ignore", category=UserWarning):  # about cancelled tasks
                 results.close()
 
 
