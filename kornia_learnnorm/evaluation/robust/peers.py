@@ -23,24 +23,22 @@ Peer = Callable[..., Any]
 CALIBRATED = "-calibrated"  # suffix of the names of estimators that know the cameras; a failure where a store has none
 
 
-def _opencv(method: str, cv2: Any, x1: Array, x2: Array, sizes: Sizes, seed: int, threshold: float) -> Any:
+def _opencv(
+    name: str, cv2: Any, x1: Array, x2: Array, sizes: Sizes, seed: int, threshold: float, K: Array | None = None
+) -> Any:
     # These methods draw their samples from a generator with a fixed seed: runs differ by the order of the matches.
+    method = getattr(cv2, name)
     try:
-        return cv2.findFundamentalMat(x1, x2, getattr(cv2, method), threshold)[0]
+        if K is None:
+            return cv2.findFundamentalMat(x1, x2, method, threshold)[0]
+        E = cv2.findEssentialMat(x1, x2, K[0], None, K[1], None, method=method, threshold=threshold)[0]
     except cv2.error:  # an assertion in USAC, where it has fewer inliers than it samples
         return None
+    return None if E is None or E.shape != (3, 3) else _to_pixels(E, K)
 
 
 def _poselib(poselib: Any, x1: Array, x2: Array, sizes: Sizes, seed: int, threshold: float) -> Any:
     return poselib.estimate_fundamental(x1, x2, {"max_epipolar_error": threshold, "seed": seed}, {})[0]
-
-
-def _opencv_calibrated(cv2: Any, x1: Array, x2: Array, sizes: Sizes, seed: int, threshold: float, K: Array) -> Any:
-    try:
-        E = cv2.findEssentialMat(x1, x2, K[0], None, K[1], None, method=cv2.USAC_MAGSAC, threshold=threshold)[0]
-    except cv2.error:
-        return None
-    return None if E is None or E.shape != (3, 3) else _to_pixels(E, K)
 
 
 def _poselib_calibrated(poselib: Any, x1: Array, x2: Array, sizes: Sizes, seed: int, threshold: float, K: Array) -> Any:
@@ -88,7 +86,7 @@ PEERS: dict[str, tuple[str, Callable[..., Any]]] = {
     "opencv-usac": ("cv2", partial(_opencv, "USAC_DEFAULT")),
     "opencv-usac-accurate": ("cv2", partial(_opencv, "USAC_ACCURATE")),
     "opencv-usac-magsac": ("cv2", partial(_opencv, "USAC_MAGSAC")),
-    f"opencv-usac-magsac{CALIBRATED}": ("cv2", _opencv_calibrated),
+    f"opencv-usac-magsac{CALIBRATED}": ("cv2", partial(_opencv, "USAC_MAGSAC")),
     "poselib": ("poselib", _poselib),
     f"poselib{CALIBRATED}": ("poselib", _poselib_calibrated),
     "kornia": ("kornia.geometry.ransac", partial(_kornia, "fundamental")),
