@@ -166,6 +166,7 @@ class _Pair:
         return torch.from_numpy(passes_ratio_test(self.ratio, max_ratio)).nonzero()[:, 0]
 
 
+@dataclass(eq=False)
 class SyntheticSets:
     """Sets of matches of synthetic scenes, supervised by exact correspondences, or by further matches.
 
@@ -176,15 +177,13 @@ class SyntheticSets:
         coarse: share of scenes with matches as of learned detectors, see ``random_matches``; zero for other functions.
     """
 
-    def __init__(
-        self,
-        num_heldout: int = 48,
-        matches: Callable[..., SyntheticMatches] = random_matches,
-        labels: bool = True,
-        coarse: float = 0.0,
-    ) -> None:
-        self.num_heldout, self.labels = num_heldout, labels
-        self.matches = partial(matches, coarse=coarse) if coarse else matches
+    num_heldout: int = 48
+    matches: Callable[..., SyntheticMatches] = random_matches
+    labels: bool = True
+    coarse: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.matches = partial(self.matches, coarse=self.coarse) if self.coarse else self.matches
 
     def draw(self, num_sets: int, num_points: int, generator: Generator) -> MatchSets:
         """Return the matches of new scenes."""
