@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, by one process at a time, and their short names."""
+"""Files that are written whole or not at all, by one process at a time, their short names, and messages of errors."""
 
 import errno
 import os
@@ -21,6 +21,17 @@ def full_disk_names(path: str | Path) -> Iterator[None]:
         if error.filename is None and error.errno in FULL_DISK:
             error.filename = str(path)
         raise
+
+
+@contextmanager
+def explained(message: str, *kinds: type[Exception]) -> Iterator[None]:
+    """Let errors of some kinds be a ValueError that a message begins; without kinds all errors, each with its kind."""
+    caught = kinds or (Exception,)
+    try:
+        yield
+    except caught as error:
+        text = str(error) if kinds else f"{type(error).__name__}: {error}"
+        raise ValueError(f"{message}: {text}") from error
 
 
 def check_writable(path: str | Path) -> None:

@@ -17,7 +17,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import nn
 
-from kornia_learnnorm.files import atomic_write
+from kornia_learnnorm.files import atomic_write, explained
 from kornia_learnnorm.optional import working_folder_importable
 
 WEIGHTS = Path(__file__).parent / "weights"
@@ -61,22 +61,17 @@ def load_module(
     fitting = ", ".join([other for other in shipped if weights_model(other) == model] or shipped)
     if not path.is_file():
         raise FileNotFoundError(f"no weights {str(name)!r}: expected a .safetensors file or one of {fitting}")
-    try:
-        with safe_open(path, "pt") as file:
-            metadata = file.metadata() or {}
-            state = {key: file.get_tensor(key).clone() for key in file.keys()}  # noqa: SIM118 (not a dict)
-    except SafetensorError as error:
-        raise ValueError(f"{path} is not a safetensors file: {error}") from error
+    with explained(f"{path} is not a safetensors file", SafetensorError), safe_open(path, "pt") as file:
+        metadata = file.metadata() or {}
+        state = {key: file.get_tensor(key).clone() for key in file.keys()}  # noqa: SIM118 (not a dict)
     if (got := metadata.get("format")) != file_format:
         owner = CLASSES.get((str(got), weights_model(path)))
         held = f"{got!r} of a {owner}" if owner else repr(got)
         expected = f"{file_format!r} of a {CLASSES.get((file_format, model), 'layer')}, such as {fitting}"
         raise ValueError(f"{name}: expected format {expected}, got {held}")
-    try:
-        with torch.device("meta"):
-            module = build(dict(json.loads(metadata.get("architecture", ""))))
-    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
-        raise ValueError(f"{path} describes no {kind} of this version and class: {error}") from error
+    errors = ValueError, KeyError, TypeError, AttributeError, RuntimeError
+    with explained(f"{path} describes no {kind} of this version and class", *errors), torch.device("meta"):
+        module = build(dict(json.loads(metadata.get("architecture", ""))))
     try:
         module.load_state_dict(state, strict=True, assign=True)
     except RuntimeError as error:
@@ -195,11 +190,8 @@ def find_part(name: str, own_modules: Collection[str], *modules: Any) -> Any:
     if module not in ([own_modules] if isinstance(own_modules, str) else own_modules):
         how = f"import it by own_modules=[{module!r}], on the command line by {module}:FILE"
         raise ValueError(f"{name} is not of this package; if you trust the module, {how}")
-    with working_folder_importable():
-        try:
-            found = getattr(importlib.import_module(module), attribute)
-        except Exception as error:  # of code that is not ours
-            raise ValueError(f"{name} cannot be imported: {type(error).__name__}: {error}") from error
+    with working_folder_importable(), explained(f"{name} cannot be imported"):
+        found = getattr(importlib.import_module(module), attribute)
     if not callable(found) or getattr(found, "__module__", None) != module:
         raise ValueError(f"{name} is not a class or function that {module} defines")
     return found

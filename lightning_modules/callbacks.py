@@ -20,7 +20,7 @@ from tqdm import tqdm
 from kornia_learnnorm.data.random_sets import RandomSets, StoreSets, SyntheticSets
 from kornia_learnnorm.data.sources import StoreSamples, SyntheticSamples
 from kornia_learnnorm.estimators.linear import EightPoint
-from kornia_learnnorm.files import atomic_write, short_name
+from kornia_learnnorm.files import atomic_write, explained, short_name
 from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
 from lightning_modules.task import EstimatorTask, SetLoss
 
@@ -186,14 +186,11 @@ class ExportWeights(Callback):
         if stage != "fit":
             return
         trained = pl_module.trained
-        try:
-            with TemporaryDirectory() as folder:
-                trained.save_pretrained(path := Path(folder) / "weights.safetensors")
-                if isinstance(trained, LearnedNormalizer):
-                    parts = [trained.transform, *map(type, trained.modules())]
-                    loaded = LearnedNormalizer.from_pretrained(path, {part.__module__ for part in parts})
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"the trained weights could not be saved: {error}") from error
+        with explained("the trained weights could not be saved", TypeError, ValueError), TemporaryDirectory() as folder:
+            trained.save_pretrained(path := Path(folder) / "weights.safetensors")
+            if isinstance(trained, LearnedNormalizer):
+                parts = [trained.transform, *map(type, trained.modules())]
+                loaded = LearnedNormalizer.from_pretrained(path, {part.__module__ for part in parts})
         if isinstance(trained, LearnedNormalizer):
             _try_out(loaded, pl_module.loss, getattr(_training_data(trainer), "num_heldout", 8))
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kornia_learnnorm.files import explained
 from kornia_learnnorm.optional import import_extra
 
 Array = NDArray[np.float32]
@@ -161,11 +162,9 @@ class StoreReader:
 def open_hdf5(path: Path) -> Iterator[Any]:
     """Open an HDF5 file to read; its errors, also those of the block, become a ValueError that names the file."""
     h5py = import_extra("h5py", "images", READING)
-    try:
-        with h5py.File(path, "r") as file:
-            yield file
-    except (OSError, RuntimeError, KeyError) as error:
-        raise ValueError(f"{path} is not a readable HDF5 file (truncated or of another kind): {error}") from error
+    message = f"{path} is not a readable HDF5 file (truncated or of another kind)"
+    with explained(message, OSError, RuntimeError, KeyError), h5py.File(path, "r") as file:
+        yield file
 
 
 def own_dataset(group: Any, name: str) -> Any:

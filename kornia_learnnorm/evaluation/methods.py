@@ -2,8 +2,7 @@
 
 import inspect
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from hashlib import sha256
 from pathlib import Path
 from pkgutil import resolve_name
@@ -15,7 +14,7 @@ from kornia_learnnorm.estimators.learned_layer import FORMAT as LAYER_FORMAT
 from kornia_learnnorm.estimators.linear import solve_in_coordinates
 from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.evaluation.searched_normalizer import SearchedNormalizer
-from kornia_learnnorm.files import short_name
+from kornia_learnnorm.files import explained, short_name
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.normalizers.closed_form import Hartley, Identity, Whitening
@@ -119,31 +118,22 @@ def _find_normalizer(name: str) -> Normalizer:
 def _own_normalizer(name: str) -> Normalizer:
     """Return a user's normaliser; its errors become a ValueError with its name."""
     found = _import(name)
-    with _explained(f"{name!r} cannot be made without arguments, as the class of a method must"):
+    with explained(f"{name!r} cannot be made without arguments, as the class of a method must"):
         made = found() if isinstance(found, type) else found
     if not callable(made):
         raise ValueError(f"{name!r} is not a normaliser: it cannot be called")
 
     def normalize(points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        with _explained(f"{name} failed, called with points1, points2 and weights"):
+        with explained(f"{name} failed, called with points1, points2 and weights"):
             return normalizing_transforms(made, LinearProblem.from_points(points1, points2, weights, Fundamental()))
 
     return normalize
 
 
-@contextmanager
-def _explained(message: str) -> Iterator[None]:
-    """Raise a ValueError with a message for any exception of code that is not ours."""
-    try:
-        yield
-    except Exception as error:
-        raise ValueError(f"{message}: {type(error).__name__}: {error}") from error
-
-
 def _import(name: str) -> Any:
     """Import a class or function by its import path, from the current folder too, as ``python -m`` does."""
     expected = f"no normaliser at {name!r}, expected module:Name, looked for in {Path.cwd()} too"
-    with _explained(expected), working_folder_importable():
+    with explained(expected), working_folder_importable():
         return resolve_name(name)
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from kornia_learnnorm.data.datasets.frames import Frame
 from kornia_learnnorm.data.datasets.textfiles import camera_matrix, text_lines
 from kornia_learnnorm.data.images import image_size
+from kornia_learnnorm.files import explained
 from kornia_learnnorm.optional import import_extra
 
 # Index of the first distortion parameter of a camera model (COLMAP's source, sensor/models.h). These parameters are the
@@ -58,10 +59,9 @@ def read_reconstruction(model: Path) -> Any:
     for name in ("cameras", "images", "points3D"):
         if not any((model / f"{name}.{suffix}").is_file() for suffix in ("bin", "txt")):
             raise FileNotFoundError(f"no COLMAP model at {model}: it lacks {name}.bin or {name}.txt")
-    try:
+    # IndexError: a reference to a missing camera or point
+    with explained(f"the COLMAP model {model} cannot be read", ValueError, IndexError, RuntimeError):
         return pycolmap.Reconstruction(str(model))
-    except (ValueError, IndexError, RuntimeError) as error:  # IndexError: a reference to a missing camera or point
-        raise ValueError(f"the COLMAP model {model} cannot be read: {error}") from error
 
 
 def _frame(image: Any, path: Path) -> Frame:

@@ -9,6 +9,8 @@ import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from numpy.typing import NDArray
 
+from kornia_learnnorm.files import explained
+
 Array = NDArray[np.float64]
 
 
@@ -51,13 +53,10 @@ def text_lines(path: Path, what: str) -> Iterator[TextLine]:
     """Yield the lines that are neither empty nor a comment."""
     if not path.is_file():
         raise FileNotFoundError(f"no {what} at {path}")
-    with path.open(encoding="utf-8-sig") as file:
-        try:
-            for number, line in enumerate(file, 1):
-                if line.strip() and not line.startswith("#"):
-                    yield TextLine(path, number, line.strip())
-        except UnicodeDecodeError as error:
-            raise ValueError(f"{path} is not a text file in UTF-8: {error}") from error
+    with path.open(encoding="utf-8-sig") as file, explained(f"{path} is not a text file in UTF-8", UnicodeDecodeError):
+        for number, line in enumerate(file, 1):
+            if line.strip() and not line.startswith("#"):
+                yield TextLine(path, number, line.strip())
 
 
 def rigid_motion(rotation: Array, t: Array) -> Array:

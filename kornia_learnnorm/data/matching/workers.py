@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from kornia_learnnorm.files import explained
 from kornia_learnnorm.optional import import_extra
 
 
@@ -47,10 +48,8 @@ def open_workers(jobs: int, dask: str | None = None) -> Iterator[Workers]:
         yield Workers(joblib, n_jobs=jobs, backend="loky", initializer=_end_with, initargs=(os.getpid(),))
         return
     distributed = import_extra("distributed", "dask", "matching on a Dask cluster")
-    try:
+    with explained(f"a Dask scheduler needs an address as tcp://host:8786, got {dask!r}", ValueError):
         distributed.comm.get_address_host_port(dask)
-    except ValueError as error:
-        raise ValueError(f"a Dask scheduler needs an address as tcp://host:8786, got {dask!r}: {error}") from error
     # Collect an earlier client that could not connect: its finaliser would wait for a lock of the new one.
     gc.collect()
     client = distributed.Client(dask)

@@ -19,6 +19,7 @@ from kornia_learnnorm.evaluation.methods import Method, find_method, identify_me
 from kornia_learnnorm.evaluation.runs import results_store
 from kornia_learnnorm.evaluation.runs.results_store import About, Arrays, Job, Stores, array_path, read_arrays
 from kornia_learnnorm.evaluation.tables import names_of
+from kornia_learnnorm.files import explained
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.geometry.problem import LinearProblem
@@ -215,10 +216,8 @@ def _samples(
 ) -> MatchSets:
     """Return the samples within the limit on the residual; write all that were drawn."""
     limit = options.max_residual
-    try:
+    with explained(place, ValueError):
         drawn = options.draw(store, max_ratio)
-    except ValueError as error:
-        raise ValueError(f"{place}: {error}") from error
     if not path.is_file():
         residual = plain_residual(drawn.points1, drawn.points2).numpy()
         if not (residual < limit).any():

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kornia_learnnorm.data.store import CorrespondenceStore
-from kornia_learnnorm.files import atomic_write, changed_options, exclusive, write_text
+from kornia_learnnorm.files import atomic_write, changed_options, exclusive, explained, write_text
 from kornia_learnnorm.optional import import_extra
 
 FORMAT = 4  # of the folder; runs of another format are refused
@@ -137,10 +137,8 @@ def _read(folder: Path) -> dict[str, Any]:
     path = folder / "run.json"
     if not path.is_file():
         return {}
-    try:
+    with explained(f"{path} is damaged, it is not JSON", ValueError):
         found = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged, it is not JSON: {error}") from error
     sections: dict[str, Any] = found if isinstance(found, dict) else {}
     if (number := sections.pop("format", None)) != FORMAT:
         advice = "another version of the package made it, remove it or give another folder to --out"
@@ -174,11 +172,9 @@ def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
 
 def read_arrays(path: Path, keys: Sequence[str] = (), rows: int | None = None) -> dict[str, Tensor]:
     """Return the arrays of a file; raise ValueError if it is damaged, lacks ``keys`` or these have not ``rows``."""
-    try:
-        with path.open("rb") as file, np.load(file) as data:
-            found = {key: torch.from_numpy(value) for key, value in data.items()}
-    except (OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"{path} is damaged, remove it: {error}") from error
+    errors = OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile, zlib.error
+    with explained(f"{path} is damaged, remove it", *errors), path.open("rb") as file, np.load(file) as data:
+        found = {key: torch.from_numpy(value) for key, value in data.items()}
     if lacks := [key for key in keys if key not in found]:
         raise ValueError(f"{path} is damaged, remove it: expected arrays {', '.join(lacks)}, got {', '.join(found)}")
     for key in keys:
