@@ -62,12 +62,13 @@ def _append(dataset: Any, rows: NDArray[Any]) -> None:
         dataset[-len(rows) :] = rows
 
 
-def check_target(path: str | Path) -> None:
-    """Raise FileNotFoundError or ValueError if no store can be written to a path; nothing is written."""
+def check_target(path: str | Path) -> Path:
+    """Return the folder of a store's parts; FileNotFoundError or ValueError if no store can be written to the path."""
     check_writable(path)
-    folder = _folder(Path(path))
+    folder = Path(f"{Path(path)}.parts")
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"cannot write {path}: its parts are written to {folder}, which is not a folder")
+    return folder
 
 
 class StoreWriter:
@@ -80,10 +81,9 @@ class StoreWriter:
 
     def __init__(self, path: str | Path, options: dict[str, Any]) -> None:
         self.path = Path(path)
-        self.folder = _folder(self.path)
+        self.folder = check_target(self.path)
         self.options: dict[str, Any] = json.loads(json.dumps(options))
         self.skipped: dict[str, str] = {}
-        check_target(self.path)
         self.complete = self.path.exists()
         if self.complete:
             provenance = read_store(self.path).provenance
@@ -131,10 +131,6 @@ class StoreWriter:
 
     def _parts(self) -> list[Path]:
         return sorted(self.folder.glob("[0-9]*.h5"))
-
-
-def _folder(path: Path) -> Path:
-    return path.with_name(path.name + ".parts")
 
 
 def _check_options(path: Path, had: Any, options: dict[str, Any]) -> None:
