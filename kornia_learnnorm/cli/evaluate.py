@@ -100,8 +100,10 @@ def _print_tables(args: argparse.Namespace, run: Run, tables: list[Table]) -> No
     """Print the tables of a run, without columns that have no number, and append them to a list."""
     limit, trained_on = run.about["max_residual"], run.about["trained_on"]
     show = print if args.json != "-" else lambda *_, **__: None
+    errors = [(cell.store, found["truth"]) for cell in run.cells for found in cell.predictions.values()]
+    with_truth = {store for store, truth in errors if not bool(truth.isnan().all())}
     for store, about in run.about["stores"].items():
-        show(f"\n{store}: {about}{'' if _has_truth(run, store) else '; without ground truth'}")
+        show(f"\n{store}: {about}{'' if store in with_truth else '; without ground truth'}")
         if known := [name for name in run.about["methods"] if was_trained_on(store, trained_on[name])]:
             show(f"trained on pairs of this store: {', '.join(known)}")
         for cell in run.cells:
@@ -117,11 +119,5 @@ def _print_tables(args: argparse.Namespace, run: Run, tables: list[Table]) -> No
                 tables.append(table)
                 show(f"\n{text}\n\n{format_table(table.header, table.rows)}", flush=True)
     show(f"\n{LEGEND}")
-    if any(_has_truth(run, store) for store in run.about["stores"]):
+    if with_truth:
         show(TRUTH)
-
-
-def _has_truth(run: Run, store: str) -> bool:
-    """Return whether any error of a store is one against a ground truth."""
-    found = [errors["truth"] for cell in run.cells if cell.store == store for errors in cell.predictions.values()]
-    return any(bool((~truth.isnan()).any()) for truth in found)
