@@ -13,10 +13,10 @@ from kornia_learnnorm.data.images import image_size
 
 # fx, fy, cx, cy and OpenCV's k1, k2, p1, p2, k3 of the three Kinects; https://cvg.cit.tum.de/data/datasets/rgbd-dataset,
 # file formats, calibration of the colour camera. The images of the third are already undistorted.
-KINECTS: dict[str, tuple[tuple[float, float, float, float], tuple[float, ...]]] = {
-    "1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
-    "2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
-    "3": ((535.4, 539.2, 320.1, 247.6), ()),
+KINECTS: dict[str, tuple[Array, tuple[float, ...]]] = {
+    "1": (camera_matrix(517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "2": (camera_matrix(520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "3": (camera_matrix(535.4, 539.2, 320.1, 247.6), ()),
 }
 
 
@@ -35,8 +35,7 @@ def read_tum(root: str | Path, sequences: Sequence[str] | None = None, max_diffe
     frames = []
     for name, folder in choose_sequences("tum", root, sequences).items():
         kinect = re.search(r"(?<![a-z])fr(?:eiburg)?([1-3])(?!\d)", name)
-        focal, distortion = KINECTS[kinect[1]] if kinect else (None, ())
-        K = camera_matrix(*focal) if focal else np.full((3, 3), np.nan)
+        K, distortion = KINECTS[kinect[1]] if kinect else (np.full((3, 3), np.nan), ())
         trajectory = _trajectory(folder / "groundtruth.txt")
         for time, listed in _images(folder):
             # Stamps have microseconds; at 1e9 s float64 resolves a quarter of one, which must not decide on ties.
