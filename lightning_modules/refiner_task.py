@@ -108,11 +108,6 @@ class RefinerTask(EstimatorTask):
         for name in ("found", "moved"):
             self.metrics[f"median_{name}"] = Median().set_dtype(torch.float64)
 
-    @property
-    def trained(self) -> Any:
-        """The refiner, whose weights ``from_pretrained`` reads."""
-        return self.estimator
-
     def compute_loss(self, batch: MatchSets) -> Tensor:
         """Return the mean loss of a batch."""
         loss: Tensor = self.loss(batch, self._move(batch)).mean()

@@ -146,9 +146,9 @@ class EstimatorTask(pl.LightningModule):
     @property
     def trained(self) -> LearnedLayer | LearnedNormalizer:
         """The module that learns, whose weights ``from_pretrained`` reads."""
-        if isinstance(self.estimator, LearnedLayer):
-            return self.estimator
-        return cast(LearnedNormalizer, self.estimator.normalizer)
+        if isinstance(self.estimator, EightPoint):
+            return cast(LearnedNormalizer, self.estimator.normalizer)
+        return self.estimator
 
     def configure_optimizers(self) -> Any:
         """Build the optimiser and its schedule."""
