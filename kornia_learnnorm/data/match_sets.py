@@ -1,6 +1,6 @@
 """Sets of correspondences of image pairs: samples of eight, or matches with outliers, with their supervision."""
 
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -33,8 +33,7 @@ class MatchSets(NamedTuple):
 
     def select(self, rows: Tensor) -> Self:
         """Return the sets of the given rows (indices or mask)."""
-        parts: dict[str, Any] = {k: None if part is None else part[rows] for k, part in self._asdict().items()}
-        return self._replace(**parts)
+        return type(self)._make(None if part is None else part[rows] for part in self)
 
     def with_residual_below(self, max_residual: float | None) -> Self:
         """Return the sets whose :func:`plain_residual` is below a limit in pixels; None keeps all."""

@@ -229,9 +229,7 @@ def framed(rng: Random, cv2: Any, paint: Painter, size: Metres, density: float) 
     paint(rng, cv2, texture)
     edge = int(0.05 * density)
     for inset, tone in ((2 * edge, 0.92), (edge, 0.12)):
-        border = np.ones(texture.shape, bool)
-        border[inset:-inset, inset:-inset] = False
-        texture[border] = tone
+        texture = np.pad(texture[inset:-inset, inset:-inset], inset, constant_values=tone)
     texture += 0.03 * noise(rng, cv2, texture.shape, finest=4)
     return np.asarray(cv2.GaussianBlur(texture, None, 0.8), np.float32)
 
