@@ -259,7 +259,6 @@ def answer(*inputs: Any, progress: gr.Progress = PROGRESS) -> list[Any]:
 
 
 def _point(result: Result | None, event: gr.SelectData) -> Any:
-    """Return the picture with the point that was clicked, and its epipolar line."""
     return gr.skip() if result is None else draw_result(result, event.index)
 
 

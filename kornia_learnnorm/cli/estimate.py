@@ -124,7 +124,6 @@ def _estimate(args: argparse.Namespace, options: many_pairs.PairOptions) -> Pair
 
 
 def _print_hint(args: argparse.Namespace) -> None:
-    """Print, to standard error, what is more accurate than the default."""
     if args.detector == many_pairs.PairOptions.detector:
         print(f"matched SIFT features; {HINT}", file=sys.stderr)
 

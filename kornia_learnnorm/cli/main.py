@@ -129,7 +129,6 @@ def _examples(lines: str) -> str:
 
 
 def _add_training_arguments(parser: argparse.ArgumentParser, name: str) -> None:
-    """Add the options of a training command that are needed most to a parser."""
     parser.add_argument("--help-all", action="store_true", help="list all options: the entries of a configuration")
     text = "configuration: a name that learnnorm config lists, or a file; can be repeated, later entries win"
     parser.add_argument("--config", metavar="NAME_OR_FILE", action="append", required=True, help=text)
@@ -166,7 +165,6 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
 
 
 def _print_completion(args: argparse.Namespace) -> int:
-    """Print a script that completes commands, options and files."""
     shtab = import_extra("shtab", "completion", "completion in the shell")
     from lightning_modules.config_files import config_names
 

@@ -191,7 +191,6 @@ def _match_rest(
 
 
 def _detect(frame: Frame, options: MatchOptions) -> Found:
-    """Return the features of a frame, or the reason why it cannot be read."""
     import_cv2().setNumThreads(1)
     try:
         image = read_frame(frame, options.detector in READS_COLOUR)
@@ -201,7 +200,6 @@ def _detect(frame: Frame, options: MatchOptions) -> Found:
 
 
 def _match(pair: FramePair, features1: Found, features2: Found, options: MatchOptions, place: int) -> Result:
-    """Return the store of a pair, or the reason why there is none."""
     if isinstance(features1, str):
         return features1
     if isinstance(features2, str):
