@@ -108,8 +108,7 @@ def _cameras(typed: str | None, files: Sequence[Path]) -> tuple[str, ...]:
     """Return the cameras, none, one or two, as ``PairOptions`` takes them."""
     texts = [text.strip() for text in (typed or "").split(";") if text.strip()]
     if (texts and files) or len([*texts, *files]) > 2:
-        got = f"got {len(texts)} and {len(files)}"
-        raise ValueError(f"cameras: one or two expected, typed or as files, {got}")
+        raise ValueError(f"cameras: one or two expected, typed or as files, got {len(texts)} and {len(files)}")
     if wrong := [text for text in texts if not CAMERA.fullmatch(text)]:
         raise ValueError(f"camera {wrong[0]}: expected {CAMERAS}")
     return tuple(texts or map(str, files))

@@ -74,8 +74,7 @@ class HubModel(nn.Module, PyTorchModelHubMixin, library_name="kornia_learnnorm",
 
     def generate_model_card(self, *args: Any, **kwargs: Any) -> ModelCard:
         """Return the model card; ``model_card_kwargs`` of the mixin's methods override its values."""
-        names = ", ".join(self.layer.trained_on) or "not known"
-        words = {"class_name": type(self.layer).__name__, "trained_on": names}
+        words = {"class_name": type(self.layer).__name__, "trained_on": ", ".join(self.layer.trained_on) or "not known"}
         return super().generate_model_card(*args, **{**words, **kwargs})
 
     def _save_pretrained(self, save_directory: Path) -> None:
@@ -90,6 +89,5 @@ class HubModel(nn.Module, PyTorchModelHubMixin, library_name="kornia_learnnorm",
         path = local / WEIGHTS_FILE if local.is_dir() else Path(hf_hub_download(model_id, WEIGHTS_FILE, **download))
         name = (config or {}).get("class_name")
         if name not in LAYERS:
-            expected = " or ".join(LAYERS)
-            raise ValueError(f"{CONFIG_FILE} of {model_id} must have class_name {expected}, got {name!r}")
+            raise ValueError(f"{CONFIG_FILE} of {model_id} must have class_name {' or '.join(LAYERS)}, got {name!r}")
         return cls(LAYERS[name].from_pretrained(path)).eval()

@@ -110,8 +110,7 @@ class BatchLoader:
         return torch.split(torch.argsort(samples.pair, stable=True), counts.tolist())
 
     def _sizes(self, epoch: int) -> list[int]:
-        blocks = self.source.blocks(self._seed(epoch))
-        return [block.pairs if self.by_pair else block.samples for block in blocks]
+        return [block.pairs if self.by_pair else block.samples for block in self.source.blocks(self._seed(epoch))]
 
     def _draw(self, epoch: int, block: int) -> MatchSets:
         seed = self._seed(epoch)

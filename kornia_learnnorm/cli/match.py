@@ -92,8 +92,7 @@ def run(args: argparse.Namespace) -> int:
     resized = f", resized to {args.resize[0]}x{args.resize[1]}" if args.resize else ""
     about = {"dataset": f"{DATASETS[args.reader][0]} {', '.join(names)}{resized}", "pairs": pairing}
     wrote = "" if args.out.exists() else "wrote "
-    skipped = collect_matches(pairs, args.out, options, about, args.jobs, args.dask)
-    print_skipped(skipped)
+    print_skipped(collect_matches(pairs, args.out, options, about, args.jobs, args.dask))
     store = read_store(args.out)
     known = int(np.isfinite(store.F).all((1, 2)).sum())
     print(f"{wrote}{args.out}: {len(store)} pairs, {known} with ground truth, {store.offsets[-1]} matches")

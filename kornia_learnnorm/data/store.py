@@ -143,8 +143,7 @@ class StoreReader:
                 raise ValueError(f"{self.path}: {name} holds NaN or infinite numbers")
         if "score" in arrays and not ((arrays["score"] >= 0) & (arrays["score"] <= 1)).all():
             raise ValueError(f"{self.path}: score must be from 0 to 1, got other numbers")
-        counts = np.diff(self.offsets)[list(pairs)]
-        offsets = np.concatenate([[0], counts.cumsum()]).astype(np.int64)
+        offsets = np.concatenate([[0], np.diff(self.offsets)[list(pairs)].cumsum()]).astype(np.int64)
         return CorrespondenceStore(offsets=offsets, names=names, **arrays, **about, provenance=provenance)
 
     def passing(self, max_ratio: float | None) -> NDArray[np.int64]:

@@ -65,8 +65,7 @@ class FramePair(NamedTuple):
     @property
     def F(self) -> NDArray[np.float64]:  # noqa: N802
         """Return F with x2^T F x1 = 0 and unit norm, (3, 3); NaN where unknown or if the camera did not move."""
-        cameras_and_motion = self.frame1.K, self.frame2.K, *self.motion
-        return np.asarray(fundamental_from_motion(*map(torch.from_numpy, cameras_and_motion)))
+        return fundamental_from_motion(*map(torch.from_numpy, (self.frame1.K, self.frame2.K, *self.motion))).numpy()
 
 
 def resize_frames(frames: Iterable[Frame], size: Size) -> list[Frame]:

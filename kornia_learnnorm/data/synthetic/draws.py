@@ -13,8 +13,7 @@ GROUND_SHARE = 0.9  # of the points whose ray meets the ground plane
 
 def uniform(shape: tuple[int, ...], low: float, high: float, generator: Generator) -> Tensor:
     """Draw uniform numbers between ``low`` and ``high``."""
-    values = torch.rand(shape, generator=generator, dtype=torch.float64, device=generator.device)
-    return low + (high - low) * values
+    return low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64, device=generator.device)
 
 
 def log_uniform(shape: tuple[int, ...], low: float, high: float | Tensor, generator: Generator) -> Tensor:

@@ -125,8 +125,7 @@ def _corrupt(
     learned = scale.new_zeros(batch_size, 1, dtype=torch.bool)
     if coarse:
         learned = draws.uniform((batch_size, 1), 0.0, 1.0, generator) < coarse
-        wide = draws.log_uniform((batch_size, 1, 1), 0.2, 1.5, generator)
-        scale = torch.where(learned[..., None], wide, scale)
+        scale = torch.where(learned[..., None], draws.log_uniform((batch_size, 1, 1), 0.2, 1.5, generator), scale)
     shape = (batch_size, num_points, 2)
     noise1, noise2 = (
         torch.where(heavy, 0.6 * draws.student_t(shape, generator), draws.normal(shape, generator)) for _ in range(2)

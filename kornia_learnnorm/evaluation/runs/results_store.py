@@ -147,8 +147,7 @@ def _read(folder: Path) -> dict[str, Any]:
 
 
 def _write(folder: Path, section: str, about: About) -> None:
-    content = {"format": FORMAT, **_read(folder), section: about}
-    write_text(folder / "run.json", json.dumps(content, indent=1))
+    write_text(folder / "run.json", json.dumps({"format": FORMAT, **_read(folder), section: about}, indent=1))
 
 
 def file_name(name: str) -> str:
