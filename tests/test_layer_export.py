@@ -103,7 +103,7 @@ def test_any_batch_and_number_of_points_also_without_the_package(tmp_path, monke
 def test_siblings(cls, kind, monkeypatch):
     for part, name in ((pose_stages, "EARLY_STEPS"), (pose_stages, "LOCAL_STEPS"), (homography_stages, "LOCAL_STEPS")):
         monkeypatch.setattr(part, name, 1)
-    layer = cls(width=8, depth=1, refine_steps=1, samples=4)
+    layer = cls(width=8, depth=1, stages=1, refine_steps=1, samples=4)
     program = export_layer(layer, ["scores"]).module()
     for size in SIZES:
         check(program, layer, *sets(*size, kind), scores=torch.rand(size))
