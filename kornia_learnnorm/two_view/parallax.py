@@ -18,14 +18,12 @@ from torch import Tensor
 
 from kornia_learnnorm.data.images import Size, import_cv2
 from kornia_learnnorm.estimators.optimize import RobustCost, minimize
-from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.transforms import affine_transform
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.models.two_view_model import Residuals
-from kornia_learnnorm.ransac.final_fit import LOSS_SCALE
 from kornia_learnnorm.ransac.samplers import draw_distinct
 from kornia_learnnorm.ransac.scoring import PairScorer
 
@@ -163,7 +161,7 @@ def sign_evidence(points1: Tensor, points2: Tensor, F_mat: Tensor, offsets: Tens
 
 
 def fit_plane_and_parallax(points1: Tensor, points2: Tensor, H: Tensor, threshold: float, seed: int) -> Tensor | None:
-    """Return the fundamental matrix of a homography and an epipole that most matches agree with, refined on all.
+    """Return the fundamental matrix (3, 3) of a homography and an epipole that most matches agree with.
 
     None where fewer than three matches are off the plane. The threshold is on the Sampson distance (O. Chum, T. Werner,
     J. Matas, Two-view geometry estimation unaffected by a dominant plane, CVPR 2005).
@@ -181,10 +179,7 @@ def fit_plane_and_parallax(points1: Tensor, points2: Tensor, H: Tensor, threshol
     epipole = torch.linalg.cross(*torch.linalg.cross(x1 @ H.mT, x2).unbind(1))
     scorer = PairScorer(points1, points2, threshold, Fundamental())
     found = scorer.best(scorer.from_pixels(unit_matrix(cross_product_matrix(epipole) @ H)), 1).F_mat
-    if len(found) == 0:
-        return None
-    loss = GemanMcClure(LOSS_SCALE * threshold)
-    return refine_fundamental(points1[None], points2[None], scorer.to_pixels(found), loss=loss).F_mat[0]
+    return unit_matrix(scorer.to_pixels(found))[0] if len(found) else None
 
 
 def offsets_from_plane(

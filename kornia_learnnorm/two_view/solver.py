@@ -145,12 +145,10 @@ class TwoViewSolver:
 
     def refine(self, F_mat: Tensor) -> Tensor:
         """Return the matrix refined on the robust loss with which RANSAC ends, of known cameras if there are."""
-        if self.cameras is None:
-            return self._refine_at(LOSS_SCALE * self.threshold, F_mat)
         start = self.scorer.best(self.scorer.from_pixels(F_mat[None]), 1)
         if len(start.F_mat) == 0:
             return F_mat
-        scorer = self.scorer.of_cameras(*self.cameras)
+        scorer = self.scorer if self.cameras is None else self.scorer.of_cameras(*self.cameras)
         return unit_matrix(scorer.to_pixels(fit_final(scorer, start).matrix()))[0]
 
     def distance(self, M: Tensor, model: Model = "fundamental") -> Tensor:
@@ -209,10 +207,6 @@ class TwoViewSolver:
             F_mat = other
         return F_mat
 
-    def _refine_at(self, scale: float, F_mat: Tensor) -> Tensor:
-        loss = GemanMcClure(scale)
-        return refine_fundamental(self.points1[None], self.points2[None], F_mat[None], loss=loss).F_mat[0]
-
     def _try_plane_and_parallax(self, F_mat: Tensor) -> Tensor:
         """Return the matrix of a plane and parallax where one homography explains most inliers and it scores higher."""
         inliers = self.distance(F_mat) < self.threshold
@@ -225,15 +219,15 @@ class TwoViewSolver:
         if float((off_plane[inliers] < 3 * self.threshold).double().mean()) <= parallax.MIN_PLANAR_SHARE:
             return F_mat
         other = parallax.fit_plane_and_parallax(self.points1, self.points2, H, self.threshold, self.seed)
-        if other is not None and self._score(other) > MIN_SCORE_GAIN * self._score(F_mat):
+        if other is not None and self._score(other := self.refine(other)) > MIN_SCORE_GAIN * self._score(F_mat):
             F_mat = other
         distance = self.distance(F_mat)
         inliers = distance < self.threshold
-        matches = self.points1, self.points2
-        evidence = parallax.parallax_evidence(*matches, F_mat, off_plane, self.threshold, (1.0,))
+        evidence = parallax.parallax_evidence(self.points1, self.points2, F_mat, off_plane, self.threshold, (1.0,))
         if evidence <= parallax.MAX_LOG_CHANCE_PARALLAX or not bool(inliers.any()):
             return F_mat
         # Parallax that is smaller than the threshold decides the epipole of a scene that is nearly a plane. So would
         # the inliers of largest error, if the scale of the loss were not the median distance of the inliers.
         scale = distance[inliers].median().clamp(MIN_LOSS_SCALE * self.threshold, LOSS_SCALE * self.threshold)
-        return self._refine_at(float(scale), F_mat)
+        matches = self.points1[None], self.points2[None]
+        return refine_fundamental(*matches, F_mat[None], loss=GemanMcClure(float(scale))).F_mat[0]
