@@ -106,12 +106,14 @@ def find_camera_doubt(
             return (PairWarning("cameras", f"{text}too short for these points: they must be pixels"),)
         if max(fx, fy) > min(MAX_ASPECT * min(fx, fy), MAX_FOCAL * float(points.max())):
             return (PairWarning("cameras", f"{text}which is implausible for these points"),)
-        if size is None:
-            continue
-        x, y = centre = K[:2, 2] / K[2, 2] / torch.tensor(size)
-        offset = (centre - 0.5).abs()
-        if bool((offset > 0.5).any() or (offset > MAX_OFFSET).all()):
-            text = f"the principal point of {name} is at {x:.0%} of the width and {y:.0%} of the height of its image"
+        # Where the size is not known, the principal point is off the centre of the points, too.
+        centre, high = K[:2, 2] / K[2, 2], points.amax(0) if size is None else points.new_tensor(size)
+        low = points.amin(0) if size is None else torch.zeros_like(high)
+        (x, y), offset, among = centre / high, (centre / high - 0.5).abs(), ((centre - low) / (high - low) - 0.5).abs()
+        outside = size is not None and bool((offset > 0.5).any())
+        if outside or bool((offset.minimum(among) > MAX_OFFSET).all()):
+            image = "its image, as far as its points show" if size is None else "its image"
+            text = f"the principal point of {name} is at {x:.0%} of the width and {y:.0%} of the height of {image}"
             return (PairWarning("cameras", f"{text}: {name} may be that of another image size"),)
     if F_mat is None:
         return ()

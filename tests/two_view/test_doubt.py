@@ -170,6 +170,9 @@ def test_cameras_that_cannot_be():
             camera = torch.tensor([[600.0, 0, camera[0]], [0, 600, camera[1]], [0, 0, 1]])
         doubt = pair_warnings.find_camera_doubt((K, camera), (None, CAMERA_SIZE), *POINTS, None, 1.0)
         assert [text in warning.text for warning in doubt] == ([] if text is None else [True])
+    for scale in (0.5, 1.0, 2.0):  # of images of unknown size
+        camera = torch.diag(torch.tensor([scale, scale, 1.0])).double() @ K
+        assert bool(pair_warnings.find_camera_doubt((K, camera), (None, None), *POINTS, None, 1.0)) == (scale != 1)
 
 
 class TestCameraMisfit:
