@@ -5,7 +5,8 @@ import shlex
 import sys
 from pathlib import Path
 
-import torch
+import numpy as np
+from numpy.typing import NDArray
 
 from kornia_learnnorm.cli.match import add_matching_arguments, print_skipped
 from kornia_learnnorm.data.cameras import read_camera
@@ -16,9 +17,8 @@ from kornia_learnnorm.data.matching.match_store import MatchOptions, collect_mat
 from kornia_learnnorm.data.matching.workers import check_jobs
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
-from kornia_learnnorm.two_view.colmap_database import THRESHOLD, check_database, export_colmap
+from kornia_learnnorm.two_view.colmap_database import THRESHOLD, check_database, check_images, export_colmap
 from kornia_learnnorm.two_view.inputs import check_settings
-from kornia_learnnorm.two_view.pair_warnings import find_camera_doubt
 
 EXAMPLES = """\
 learnnorm export-colmap PHOTOS --out photos.db --single-camera
@@ -58,14 +58,10 @@ def run(args: argparse.Namespace) -> int:
     if args.out.suffix == MATCHES:
         raise ValueError(f"--out {args.out}: this is where the matches go, expected a name such as photos.db")
     estimation = {"layer": layer, "threshold": args.threshold, "seed": args.seed, "jobs": args.jobs}
-    store, turned = _matches(args), len(args.matches) != 2
-    if K is not None and len(store):
-        points1, points2 = (torch.from_numpy(points) for points in store.matches(0, None)[:2])
-        size1, size2 = ((int(width), int(height)) for width, height in store.image_size[0])
-        camera = torch.from_numpy(K)
-        for doubt in find_camera_doubt((camera, camera), (size1, size2), points1, points2, None, args.threshold):
-            print(f"warning: {doubt.text.replace('K1', 'K')}", file=sys.stderr)
+    store, turned = _matches(args, K), len(args.matches) != 2
     counts = export_colmap(store, args.root, args.out, K, args.single_camera, turned=turned, **estimation)
+    for doubt in counts.doubts:
+        print(f"warning: {doubt.text.replace('K1', 'K')}", file=sys.stderr)
     verified = f"{counts.verified} of {counts.pairs} pairs verified"
     inliers = f"{counts.inliers} of {counts.matches} matches are their inliers"
     print(f"wrote {args.out}: {counts.images} images; {verified}, {inliers}")
@@ -76,13 +72,14 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _matches(args: argparse.Namespace) -> CorrespondenceStore:
+def _matches(args: argparse.Namespace, K: NDArray[np.float64] | None) -> CorrespondenceStore:
     if len(args.matches) > 2:
         raise ValueError(f"--matches: a store, or hloc's features and matches expected, got {len(args.matches)} files")
     if args.matches:
         return read_store(*args.matches) if len(args.matches) == 1 else read_hloc(*args.matches)
     frames = read_dataset("folder", args.root)
     pairs, pairing = choose_pairs(frames, args.gap, args.pairs)
+    check_images(args.root, [frame.name for frame in frames], K, args.single_camera)
     print(f"{len(frames)} images; {len(pairs)} pairs ({pairing})", file=sys.stderr)
     store = args.out.with_suffix(MATCHES)
     options = MatchOptions(args.detector, args.num_features, args.matcher, max_matches=None)

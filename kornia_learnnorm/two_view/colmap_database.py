@@ -5,15 +5,16 @@ Pixels are COLMAP's in all private functions: they begin at the corner of the fi
 
 import sys
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kornia_learnnorm.data.images import Size, stored_pixels
+from kornia_learnnorm.data.images import Size, image_size, stored_pixels
 from kornia_learnnorm.data.matching.workers import open_workers
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.data.writer import check_target
@@ -27,7 +28,12 @@ from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import RATIO
 from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.two_view.inputs import check_settings, read_cameras
-from kornia_learnnorm.two_view.pair_warnings import MAX_LOG_FALSE_ALARMS, log_false_alarms
+from kornia_learnnorm.two_view.pair_warnings import (
+    MAX_LOG_FALSE_ALARMS,
+    PairWarning,
+    find_camera_doubt,
+    log_false_alarms,
+)
 from kornia_learnnorm.two_view.solver import MIN_SCORE
 
 CORNER = 0.5  # pixels from the corner of the first pixel to its centre
@@ -49,6 +55,7 @@ class DatabaseCounts(NamedTuple):
     verified: int  # pairs with a two-view geometry
     inliers: int  # of the verified pairs
     unverified: tuple[str, ...]  # names of the images without a verified pair
+    doubts: tuple[PairWarning, ...] = ()  # why the camera may be that of another image size
 
 
 class _Pair(NamedTuple):
@@ -115,12 +122,11 @@ def export_colmap(
     names = sorted({name for both in store.names for name in both})
     if missing := [name for name in names if not (images / name).is_file()]:
         raise FileNotFoundError(f"{len(missing)} of {len(names)} images are not in {images}, the first is {missing[0]}")
-    camera = None
-    if K is not None:
-        if abs(K[0, 1]) > MAX_SKEW * K[0, 0]:
-            raise ValueError(f"K must have no skew, as COLMAP's PINHOLE has none, got {K[0, 1]}")
-        camera = np.asarray(K / K[2, 2]) + np.array([[0, 0, CORNER], [0, 0, CORNER], [0, 0, 0]])
-    pairs = _read_pairs(store, images, turned)
+    camera, pairs = _colmap_camera(K), _read_pairs(store, images, turned)
+    doubts: tuple[PairWarning, ...] = ()
+    if camera is not None and pairs:
+        matrix, (points1, points2) = torch.from_numpy(camera), map(torch.from_numpy, pairs[0].points)
+        doubts = find_camera_doubt((matrix, matrix), pairs[0].sizes, points1, points2, None, threshold)
     with atomic_write(path) as temporary:
         ids = _write_images(pycolmap, temporary, images, pairs, camera, single_camera)
         arguments = ((pair, layer, threshold, seed, camera) for pair in pairs)
@@ -129,8 +135,8 @@ def export_colmap(
         _write_pairs(pycolmap, temporary, ids, pairs, found)
     verified = [(pair, geometry) for pair, geometry in zip(pairs, found, strict=True) if geometry is not None]
     unverified = tuple(sorted(ids.keys() - {name for pair, _ in verified for name in pair.names}))
-    matches, inliers = sum(len(pair.scores) for pair in pairs), sum(int(part.inliers.sum()) for _, part in verified)
-    return DatabaseCounts(len(ids), len(pairs), matches, len(verified), inliers, unverified)
+    number, inliers = sum(len(pair.scores) for pair in pairs), sum(int(part.inliers.sum()) for _, part in verified)
+    return DatabaseCounts(len(ids), len(pairs), number, len(verified), inliers, unverified, doubts)
 
 
 def check_database(path: Path) -> None:
@@ -139,6 +145,25 @@ def check_database(path: Path) -> None:
     if path.exists():
         raise FileExistsError(f"{path} exists already: remove it, or write elsewhere")
     check_target(path)
+
+
+def check_images(images: Path, names: Collection[str], K: Array | None = None, single_camera: bool = False) -> None:
+    """Raise a ValueError if COLMAP leaves out images that others can read; arguments as for :func:`export_colmap`."""
+    pycolmap = import_extra("pycolmap", "colmap", "writing a COLMAP database")
+    readable = [name for name in names if image_size(images / name) != (0, 0)]
+    with TemporaryDirectory() as folder:
+        (database := Path(folder) / "images.db").touch()
+        _import_images(pycolmap, database, images, readable, _colmap_camera(K), single_camera)
+
+
+def _colmap_camera(K: Array | None) -> Array | None:
+    """Return a camera of pixels from the corner of the first one."""
+    if K is None:
+        return None
+    if abs(K[0, 1]) > MAX_SKEW * K[0, 0]:
+        raise ValueError(f"K must have no skew, as COLMAP's PINHOLE has none, got {K[0, 1]}")
+    camera: Array = K / K[2, 2] + np.array([[0, 0, CORNER], [0, 0, CORNER], [0, 0, 0]])
+    return camera
 
 
 def _read_pairs(store: CorrespondenceStore, images: Path, turned: bool) -> list[_Pair]:
@@ -195,23 +220,33 @@ def _write_images(
 ) -> dict[str, int]:
     """Write images and cameras to a database and return the number of each image."""
     sizes = {name: size for pair in pairs for name, size in zip(pair.names, pair.sizes, strict=True)}
+    ids = {}
+    for name, image_id, stored in _import_images(pycolmap, database, images, sizes, camera, single_camera):
+        if sizes[name] != stored:
+            text = "{} was matched at {} x {} pixels, COLMAP reads {} x {}: match images at full size"
+            raise ValueError(text.format(name, *sizes[name], *stored))
+        ids[name] = image_id
+    return ids
+
+
+def _import_images(
+    pycolmap: Any, database: Path, images: Path, names: Collection[str], camera: Array | None, single_camera: bool
+) -> list[tuple[str, int, Size]]:
+    """Write images and cameras to a database and return names, numbers and sizes of the images."""
     options = pycolmap.ImageReaderOptions()
     if camera is not None:
         options.camera_model = "PINHOLE"
         options.camera_params = ",".join(str(camera[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
     mode = pycolmap.CameraMode.AUTO if camera is None and not single_camera else pycolmap.CameraMode.SINGLE
-    pycolmap.import_images(database, images, mode, sorted(sizes), options)
+    pycolmap.import_images(database, images, mode, sorted(names), options)
     with pycolmap.Database.open(database) as file:
-        found = {image.name: image for image in file.read_all_images()}
-        if missing := sorted(sizes.keys() - found.keys()):
-            text = f"COLMAP leaves out {len(missing)} of {len(sizes)} images, the first is {missing[0]}: a file that it"
+        found = file.read_all_images()
+        if missing := sorted(set(names) - {image.name for image in found}):
+            text = f"COLMAP leaves out {len(missing)} of {len(names)} images, the first is {missing[0]}: a file that it"
             raise ValueError(f"{text} cannot read or, where all share one camera, of another size or orientation")
-        for name, image in found.items():
-            stored = file.read_camera(image.camera_id)
-            if sizes[name] != (stored.width, stored.height):
-                text = "{} was matched at {} x {} pixels, COLMAP reads {} x {}: match images at full size"
-                raise ValueError(text.format(name, *sizes[name], stored.width, stored.height))
-        return {name: image.image_id for name, image in found.items()}
+        stored = [file.read_camera(image.camera_id) for image in found]
+    views = zip(found, stored, strict=True)
+    return [(image.name, image.image_id, (camera.width, camera.height)) for image, camera in views]
 
 
 def _write_pairs(

@@ -10,7 +10,7 @@ from scenes import raises, store_of
 
 from kornia_learnnorm.data.images import read_image, stored_pixels
 from kornia_learnnorm.data.store import CorrespondenceStore
-from kornia_learnnorm.two_view.colmap_database import DatabaseCounts, export_colmap
+from kornia_learnnorm.two_view.colmap_database import DatabaseCounts, check_images, export_colmap
 
 pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
 
@@ -73,7 +73,7 @@ def test_reference(images):
     """Matrices and pose are those of the cameras, in COLMAP's pixels."""
     store = make_store()
     counts, path = export(images, store, K=K)
-    assert counts._replace(inliers=0) == (4, 6, 6 * MATCHES, 6, 0, ())
+    assert counts._replace(inliers=0) == (4, 6, 6 * MATCHES, 6, 0, (), ())
     matched, inliers, geometry = read_pair(path)
     rows = slice(2 * MATCHES, 3 * MATCHES)
     np.testing.assert_allclose(matched, [store.points1[rows] + 0.5, store.points2[rows] + 0.5], atol=1e-4)
@@ -189,6 +189,7 @@ class TestErrors:
     def test_images_that_colmap_does_not_take(self, images, broken, message):
         if broken is None:
             Image.new("L", (320, 240)).save(images / NAMES[1])
+            raises(ValueError, "leaves out 1 of 4 images", check_images, images, NAMES, single_camera=True)
         else:
             (images / NAMES[1]).write_bytes(broken)
         raises(ValueError, message, export, images, turned=broken is None)
