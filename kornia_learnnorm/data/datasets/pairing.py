@@ -1,5 +1,6 @@
 """Pairs of frames: neighbours in a sequence, pairs that a file lists, or images of a COLMAP model."""
 
+import shlex
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import combinations, groupby, starmap
@@ -8,6 +9,7 @@ from pathlib import Path
 from kornia_learnnorm.data.datasets.colmap import read_reconstruction
 from kornia_learnnorm.data.datasets.frames import Frame, FramePair
 from kornia_learnnorm.data.datasets.textfiles import text_lines
+from kornia_learnnorm.files import explained
 
 
 def choose_pairs(
@@ -45,11 +47,17 @@ def pair_frames(frames: Iterable[Frame], gap: int = 1) -> Iterator[FramePair]:
 
 
 def listed_pairs(frames: Sequence[Frame], path: str | Path) -> Iterator[FramePair]:
-    """Yield the pairs that a file lists as hloc does: two names a line with white space between, no line twice."""
+    """Yield the pairs that a file lists as hloc does: two names a line with white space between, no line twice.
+
+    Names with spaces stand in quotation marks.
+    """
     path, named = Path(path), {frame.name: frame for frame in frames}
     first: dict[tuple[str, ...], int] = {}
     for line in text_lines(path, "list of pairs"):
         names = tuple(line.text.split())
+        if len(names) > 2:
+            with explained(f"{path}, line {line.number}", ValueError):
+                names = tuple(shlex.split(line.text))
         if len(names) != 2 or names[0] == names[1]:
             raise line.error("two names of two images")
         if first.setdefault(names, line.number) != line.number:

@@ -170,6 +170,8 @@ class TestListedPairs:
             ("x/0.png x/0.png", r"line 1: two names of two images expected"),
             ("x/0.png x/1.png\nx/1.png x/0.png\n\nx/0.png  x/1.png", r"line 4: .* is in line 1 already"),
             ("\nx/0.png 7.png", r"line 2: no frame '7\.png' among 4, such as 'x/0\.png'"),
+            ('"x 7.png" x/0.png', r"line 1: no frame 'x 7\.png' among 4"),
+            ("x's 7.png x/0.png", "line 1: No closing quotation"),
         ]:
             (tmp_path / "pairs.txt").write_text(text)
             raises(ValueError, message, list, listed_pairs(numbered("x"), tmp_path / "pairs.txt"))
