@@ -34,6 +34,7 @@ MAX_AREA = 3.0  # by which an affinity may enlarge or reduce
 MIN_TRACE = 0.5  # of an affinity divided by the root of its determinant; less is a turn by more than some 75 degrees
 LARGEST_STEP = 3.0  # pixels, the bound of what Lucas-Kanade gives in one window
 # Of patches with a variance of one:
+MAX_OUTSIDE = 0.2  # of the points of a view; more are pixels of another size of its image
 NOISE = 1e-2  # added to the moments of the gradients, so that patches without texture give no step
 FLOOR = 1e-3  # of the differences under their logarithm
 VARIANCE_FLOOR = 1e-4  # of the grey values of a patch, from 0 to 1
@@ -132,7 +133,8 @@ class MatchRefiner(nn.Module):
         Raises:
             TypeError: if an argument is not a tensor of the right kind, or the weights are of half precision.
             ShapeError: if an argument does not have its shape.
-            ValueError: if numbers of images and points differ, or a value is not finite or out of its range.
+            ValueError: if numbers of images and points differ, over a fifth of the points of a view lies outside of the
+                images, or a value is not finite or out of its range.
         """
         check_whole_number("passes", self.passes, 1)
         views = [points1, points2]
@@ -142,6 +144,8 @@ class MatchRefiner(nn.Module):
         check_correspondences(views[0], views[1], min_points=0)
         for name, image in (("image1", image1), ("image2", image2)):
             _check_image(name, image, len(points1))
+        for number, (image, points) in enumerate(zip((image1, image2), views, strict=True), 1):
+            _check_inside(number, image, points)
         dtype = self.shift.weight.dtype
         if dtype not in (torch.float32, torch.float64):
             raise TypeError(f"the refiner's weights must be float32 or float64, which hold pixels, got {dtype}")
@@ -246,6 +250,15 @@ def _check_image(name: str, image: Tensor, number: int) -> None:
         check_tensor(name, image, ["B", "C", "H", "W"])
     if image.ndim != 4 or len(image) != number or image.shape[1] not in (1, 3) or 0 in image.shape[2:]:
         raise ValueError(f"{name} must have shape [{number}, 1 or 3, H, W], got {[*image.shape]}")
+
+
+def _check_inside(number: int, image: Tensor, points: Tensor) -> None:
+    """Raise a ValueError if more than a fifth of the points (B, N, 2) lie outside of the images of a view."""
+    width, height = image.shape[-1], image.shape[-2]
+    outside = ((points < -1) | (points > points.new_tensor([width, height]))).any(-1)
+    if read_condition(outside.sum() > MAX_OUTSIDE * outside.numel()):
+        text = f"{int(outside.sum())} of {outside.numel()} points{number} lie outside of image{number}"
+        raise ValueError(f"{text}, {width} x {height} pixels: are they pixels of another size of it?")
 
 
 def _linear(layer: nn.Linear, values: Tensor) -> Tensor:

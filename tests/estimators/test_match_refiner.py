@@ -153,9 +153,12 @@ def test_masked_rows_come_back_as_they_are(num_points, absent):
 
 
 def test_images_without_texture_and_points_outside_move_nothing_far():
-    flat, points = torch.full((1, 1, 30, 40), 0.5), torch.tensor([[[5.0, 5], [-300, 20], [1e4, 1e4], [0, 0]]])
+    refiner, flat, points = trained().float(), torch.full((1, 1, 30, 40), 0.5), torch.zeros(1, 10, 2)
+    points[0, :2] = torch.tensor([[-300.0, 20], [1e4, 1e4]])
     for image in (flat, torch.zeros(1, 1, 1, 1), torch.ones(1, 3, 30, 40)):
-        assert all(value.isfinite().all() for value in trained().float()(image, flat, points, points))
+        assert all(value.isfinite().all() for value in refiner(image, flat, points, points))
+    message = "10 of 10 points2 lie outside of image2, 40 x 30"
+    raises(ValueError, message, refiner, flat, flat, points, points + 301)
 
 
 def test_a_second_pass_is_that_of_the_moved_points():
