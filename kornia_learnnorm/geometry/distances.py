@@ -22,9 +22,9 @@ EPIPOLE_TOLERANCE = 1e-12  # length of an epipolar line's normal over that of it
 
 
 def _check(points1: Tensor, points2: Tensor, M: Tensor, name: str = "F_mat") -> None:
-    check_tensor("points1", points1, ["*", "N", "2"])
-    check_tensor("points2", points2, ["*", "N", "2"])
-    check_tensor(name, M, ["*", "3", "3"])
+    check_tensor("points1", points1, ["*", "N", "2"], precise=True)
+    check_tensor("points2", points2, ["*", "N", "2"], precise=True)
+    check_tensor(name, M, ["*", "3", "3"], precise=True)
     if not points1.dtype == points2.dtype == M.dtype:
         raise TypeError(f"one dtype is needed, got {points1.dtype}, {points2.dtype} and {M.dtype}")
     if points1.shape[-2] != points2.shape[-2]:
@@ -47,7 +47,7 @@ def symmetric_epipolar_distance(points1: Tensor, points2: Tensor, F_mat: Tensor)
         where the residual and the normal of the epipolar line both vanish.
 
     Raises:
-        TypeError: if an argument is not a floating-point tensor, or their dtypes differ.
+        TypeError: if an argument is not a float32 or float64 tensor, or their dtypes differ.
         ShapeError: if a shape is wrong.
         ValueError: if the points do not pair up.
 
@@ -114,12 +114,13 @@ def transfer_distance(points1: Tensor, points2: Tensor, H_mat: Tensor) -> Tensor
     Errors are those of :func:`symmetric_epipolar_distance`.
 
     Args:
-        points1: pixels in the first image with shape :math:`(B, N, 2)`.
-        points2: pixels in the second image with shape :math:`(B, N, 2)`.
-        H_mat: homographies with shape :math:`(B, 3, 3)`, any scale.
+        points1: pixels in the first image with shape :math:`(B, N, 2)` or :math:`(N, 2)`.
+        points2: pixels in the second image with the same shape.
+        H_mat: homographies with shape :math:`(B, 3, 3)` or :math:`(3, 3)`, any scale.
 
     Returns:
-        distances in pixels with shape :math:`(B, N)`; the largest number of the dtype under a singular matrix.
+        distances in pixels with shape :math:`(B, N)` or :math:`(N,)`; the largest number of the dtype under a singular
+        matrix.
 
     Reference:
         R. Hartley, A. Zisserman, Multiple View Geometry, 2nd edition, Eq. 4.7.
@@ -130,9 +131,13 @@ def transfer_distance(points1: Tensor, points2: Tensor, H_mat: Tensor) -> Tensor
         tensor([[2.2361]])
     """
     _check(points1, points2, H_mat, "H_mat")
+    single = points1.ndim == H_mat.ndim == 2
+    if H_mat.ndim == 2:
+        points1, points2 = (points.reshape(-1, *points.shape[-2:]) for points in (points1, points2))
+        H_mat = H_mat.expand(len(points1), 3, 3)
     with without_autocast(points1):
         distance: Tensor = symmetric_transfer_error(points1, points2, H_mat, squared=False)
-    return distance
+    return distance[0] if single else distance
 
 
 def line_norms(

@@ -82,6 +82,7 @@ def test_exceptions(distance):
         (POINTS, POINTS, MATRICES[:, 0], ShapeError, r"\[2, 3\]"),
         (POINTS, POINTS[:, :1], MATRICES, ValueError, r"\[2, 8, 2\] and \[2, 1, 2\]"),
         (POINTS.long(), POINTS, MATRICES, TypeError, "points1 must be .* got torch.int64"),
+        (POINTS, POINTS.half(), MATRICES, TypeError, "points2 must be a float32 or float64 tensor, got torch.float16"),
         (POINTS, POINTS.numpy(), MATRICES, TypeError, "points2 must be .* got .*numpy"),
         (POINTS, POINTS, None, TypeError, "[FH]_mat must be .* got <class 'NoneType'>"),
         (POINTS, POINTS, MATRICES.float(), TypeError, "one dtype"),
@@ -126,6 +127,8 @@ class TestTransferDistance:
         expected = np.sqrt((np.concatenate(errors, -1) ** 2).sum(-1))
         np.testing.assert_allclose(transfer_distance(points1, points2, -3 * H), expected, rtol=1e-9)
         assert transfer_distance(points1.float(), points2.float(), H.float()).dtype == torch.float32
+        one, shared = (transfer_distance(*(p[i] for p in (points1, points2)), H[0]) for i in (0, slice(1)))
+        np.testing.assert_allclose([one, shared[0]], expected[[0, 0]], rtol=1e-9)
 
     def test_gradcheck(self):
         values = [v.requires_grad_() for v in (uniform(2, 5, 2), uniform(2, 5, 2, seed=1), 1 + uniform(2, 3, 3))]
