@@ -17,6 +17,8 @@ from kornia_learnnorm.geometry.checks import needs_gradient
 from kornia_learnnorm.models.two_view_model import Residuals, State, TwoViewModel
 
 FIRST_DAMPING = 1e-3  # of the diagonal of the normal matrix, added to it in the first step
+PLAIN_STEPS = 10  # from then on a step is as long as it and those that would follow
+MIN_RATE, MAX_RATE = -0.5, 0.9  # of the length of a step over that of the one before
 MAX_DAMPING = 1e8  # no step that is damped this much changes the cost by more than rounding
 MIN_PIVOT = 1e-5  # smallest diagonal entry of the Hessian's Cholesky factor, of unit rows, where it is definite
 UNROLLED_LOSS = GemanMcClure()  # of distances over their scale
@@ -51,7 +53,7 @@ class RobustCost(NamedTuple):
 
 
 class Optimum(NamedTuple):
-    """States, their costs and normal equations, convergence, damping of the next steps and number of past ones."""
+    """States, costs, normal equations, convergence, damping of the next steps, number of past steps, and the last."""
 
     state: Any
     cost: Tensor
@@ -60,6 +62,7 @@ class Optimum(NamedTuple):
     converged: Tensor
     damping: Tensor
     iterations: Tensor
+    step: Tensor  # (B, P); zero after one that was refused
 
     def map(self, function: Callable[..., Tensor], *others: Optimum) -> Optimum:
         """Return what a function makes of each tensor and its counterparts in others."""
@@ -106,24 +109,30 @@ def _descend(cost: RobustCost, best: Optimum, max_iterations: int, tolerance: fl
 def _try_step(cost: RobustCost, best: Optimum, active: Tensor, tolerance: float) -> Optimum:
     added = best.normal.diagonal(dim1=-2, dim2=-1) * best.damping[:, None]
     step = torch.linalg.solve_ex(best.normal + torch.diag_embed(added), best.gradient)[0]
-    state = best.state.retract(-cost.relaxation * step)
+    # What is left to the optimum is about a geometric series, whose ratio the last two steps tell (Aitken).
+    rate = (step * best.step).sum(-1) / best.step.square().sum(-1).clamp(min=torch.finfo(step.dtype).tiny)
+    rate = torch.where(best.iterations < PLAIN_STEPS, 0.0, rate.clamp(MIN_RATE, MAX_RATE))
+    state = best.state.retract(-(cost.relaxation / (1 - rate))[:, None] * step)
     iterations = best.iterations + active
-    moved = _evaluate(cost, state, tolerance, 0.1 * best.damping, iterations)
+    moved = _evaluate(cost, state, tolerance, 0.1 * best.damping, iterations, step)
     better = active & (moved.cost < best.cost)  # not where either is NaN
     if better.all():
         return moved
-    kept = best._replace(damping=10 * best.damping, iterations=iterations)
+    kept = best._replace(damping=10 * best.damping, iterations=iterations, step=torch.zeros_like(step))
     return moved.map(lambda new, old: torch.where(better.view(-1, *[1] * (new.ndim - 1)), new, old), kept)
 
 
-def _evaluate(cost: RobustCost, state: State, tolerance: float, damping: Tensor, iterations: Tensor) -> Optimum:
+def _evaluate(
+    cost: RobustCost, state: State, tolerance: float, damping: Tensor, iterations: Tensor, step: Tensor | None = None
+) -> Optimum:
     distance, J = cost.model.linearise(state.matrix(), cost.x1, cost.x2)
     total, normal, gradient, size = _normal_equations(cost, distance, J, state.tangents())
     diagonal = normal.diagonal(dim1=-2, dim2=-1).clamp_(min=torch.finfo(normal.dtype).tiny)
     # The cosines of the distances with their derivatives have no unit.
     flat = (gradient.square() <= tolerance**2 * size[:, None] * diagonal).all(-1)
     converged = flat | (size <= cost.rounding())
-    return Optimum(state, total, normal, gradient, converged, damping, iterations)
+    step = torch.zeros_like(gradient) if step is None else step
+    return Optimum(state, total, normal, gradient, converged, damping, iterations, step)
 
 
 def _normal_equations(

@@ -200,6 +200,14 @@ def test_tolerance_trades_steps_for_cost(loss):
     assert (loose.cost <= tight.cost * 1.002).double().mean() > 0.9
 
 
+@pytest.mark.parametrize("loss", [Huber(1.0), Cauchy(1.0), GemanMcClure(1.0)])
+def test_converges_among_outliers(loss):
+    scene = scenes("handheld", 40, 100, noise=1.0)
+    points2 = scene.points2.clone()
+    points2[:, :40] += uniform(40, 40, 2, low=-60, high=60)
+    assert refine_fundamental(scene.points1, points2, scene.F_mat, loss=loss).converged.sum() > 36
+
+
 def test_returns_the_start_where_no_step_is_possible():
     _, (points, _), start = problem(False, batch_size=5, num_points=12)
     found = refine_fundamental(*points, start, loss=lambda squares: (squares, torch.full_like(squares, torch.nan)))
