@@ -74,8 +74,8 @@ def refine_fundamental(
         loss: :math:`\rho` of squared distances: :func:`~kornia_learnnorm.estimators.robust_losses.squared_loss`,
             :class:`~kornia_learnnorm.Huber`, :class:`~kornia_learnnorm.Cauchy`,
             :class:`~kornia_learnnorm.GemanMcClure` or :class:`~kornia_learnnorm.Truncated`.
-        max_iterations: largest number of steps tried. Robust losses rarely take more than 50 among
-            outliers, and then sends no gradient.
+        max_iterations: largest number of steps tried. Robust losses rarely take more than 50 among outliers; then there
+            is no gradient.
         tolerance: largest cosine between the distances and their derivatives at which a matrix has converged. 1e-3
             saves at least half of the steps and leaves the cost within about 0.2 % of the optimum: enough for an
             estimate, not for its gradient.
