@@ -3,7 +3,6 @@
 import argparse
 import json
 import math
-from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,7 +19,6 @@ from torch import Tensor
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.datasets.frames import Frame, FramePair, fundamental_from_motion
-from kornia_learnnorm.data.synthetic.random_matches import random_planes
 from kornia_learnnorm.data.synthetic.scenes import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.two_view.result import NoReliableMatrixError
@@ -92,10 +90,9 @@ class TestPairs:
         assert pairs.outcome(pairs.score(case, Mock(side_effect=ZeroDivisionError()))) == "crashed"
         assert "room 0: ZeroDivisionError()" in capsys.readouterr().err
 
-    def test_runs(self, tmp_path, capsys):
+    def test_runs(self, tmp_path):
         arguments = ["--pairs", "3", "--kinds", "plane", "rotation", "outliers", "--size", "160", "120"]
         pairs.main([*arguments, "--json", str(tmp_path / "pairs.json")])
-        assert "| rotation |" in capsys.readouterr().out
         records = json.loads((tmp_path / "pairs.json").read_text())
         assert [record["kind"] for record in records] == ["plane", "rotation", "outliers"]
         assert [record["determined"] for record in records] == [False, False, True]
@@ -139,7 +136,7 @@ def test_every_method_is_timed(backward, monkeypatch):
     assert min(times.values()) > 0
 
 
-def test_poses_of_a_store(tmp_path, capsys):
+def test_poses_of_a_store(tmp_path):
     store, file = tmp_path / "pairs.h5", tmp_path / "poses.csv"
     write_store(store, synthetic_store(2, points=80, scenes=["orbit"]))
     names = ["RANSAC-calibrated", "learned:robust-pose-synthetic+scores"]
@@ -148,7 +145,6 @@ def test_poses_of_a_store(tmp_path, capsys):
     assert header == ["store", *poses.HEADER]
     assert [row[:2] for row in rows] == [["pairs", name] for name in names]
     assert all(float(row[2]) > 50 for row in rows)
-    assert "| RANSAC-calibrated" in capsys.readouterr().out
 
 
 def test_planes(tmp_path):
@@ -160,17 +156,6 @@ def test_planes(tmp_path):
     assert max(errors[name] for name in ("RANSAC", "opencv-usac-magsac", "learned:robust-homography")) < 20
     assert errors["kornia-dlt"] > 20
     assert planes.corner_error(None, torch.eye(3).double(), torch.zeros(4, 2).double()) == planes.MAX_ERROR
-
-
-def test_photographs_of_planes(tmp_path):
-    """The store has a plane, which counts, and a scene with relief, which does not."""
-    store = synthetic_store(2, points=200, scenes=["orbit"])
-    matches = random_planes(1, 1, 200, torch.Generator().manual_seed(0))
-    rows = store.rows(1)
-    store.points1[rows], store.points2[rows] = matches.exact1[0, : len(rows)], matches.exact2[0, : len(rows)]
-    write_store(tmp_path / "store.h5", replace(store, ratio=np.full_like(store.ratio, 0.5)))
-    planes.main(["--photographs", str(tmp_path / "store.h5"), "--csv", str(tmp_path / "planes.csv")])
-    assert float({row[0]: row[1] for row in read_csv(tmp_path / "planes.csv")}[planes.LEARNED]) > 90
 
 
 def test_refined_matches_beside_found_and_tracked_ones(tmp_path):
@@ -190,8 +175,6 @@ def test_refined_matches_beside_found_and_tracked_ones(tmp_path):
     assert header == ["store", "matches", "px", "fit", "ground-truth", "ms"]
     assert [row[:2] for row in rows] == [["store", name] for name in ("found", "moved", "Lucas-Kanade")]
     assert rows[0][2:5] == rows[1][2:5]  # untrained, it moves nothing
-    refined.main([*options, "refiner"])
-    assert [row[1] for row in read_csv(file)[1:]] == ["found", "untrained", "refiner", "Lucas-Kanade"]
 
 
 def test_reconstruction(real_data, tmp_path):
