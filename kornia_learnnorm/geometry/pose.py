@@ -20,8 +20,8 @@ def relative_pose(
 
     Args:
         F_mat: fundamental matrices with shape :math:`(B, 3, 3)`, any scale.
-        K1: cameras of the first images with shape :math:`(B, 3, 3)`.
-        K2: cameras of the second images with shape :math:`(B, 3, 3)`.
+        K1: cameras of the first images with shape :math:`(3, 3)` or :math:`(B, 3, 3)`.
+        K2: cameras of the second images with shape :math:`(3, 3)` or :math:`(B, 3, 3)`.
         points1: pixels in the first images with shape :math:`(B, N, 2)`.
         points2: pixels in the second images with shape :math:`(B, N, 2)`.
         mask: true for the correspondences that vote, such as inliers, boolean with shape :math:`(B, N)`; default: all.
@@ -50,6 +50,8 @@ def relative_pose(
         >>> bool((R - scene.R).abs().max() < 1e-6)
         True
     """
+    check_tensor("F_mat", F_mat, ["B", "3", "3"])
+    K1, K2 = (K.expand(len(F_mat), 3, 3) if isinstance(K, Tensor) and K.shape == (3, 3) else K for K in (K1, K2))
     named = {"F_mat": F_mat, "K1": K1, "K2": K2, "points1": points1, "points2": points2}
     for name, value in named.items():
         check_tensor(name, value, ["B", "N", "2"] if name.startswith("points") else ["B", "3", "3"])

@@ -234,7 +234,7 @@ def _pixels(image: Image, max_size: int, colour: bool) -> tuple[NDArray[np.uint8
         got = f"got {getattr(values, 'dtype', type(values))}: try {hint}"
         raise TypeError(f"an image must be a path or an array of uint8, {got}")
     images.check_grey(values, colour=True)
-    values = np.ascontiguousarray(values if colour else _grey(values))
+    values = np.array(values if colour else _grey(values), order="C")
     return images.resize_image(values, max_size), (values.shape[1], values.shape[0])
 
 

@@ -77,10 +77,10 @@ class TestRelativePose:
         X, t = uniform(1, 9, 3) + torch.tensor([0.0, 0.0, 5.0]), torch.tensor([[0.1, 0.2, 1.0]]).double()
         seen = [(Y / Y[..., 2:])[..., :2] for Y in (X, X + t, X - t)]
         points1, points2 = torch.cat([seen[0], seen[0]], 1), torch.cat(seen[1:], 1)
-        K, F = torch.eye(3).double()[None], torch.from_numpy(cross(t[0].numpy()))[None]
+        K, F = torch.eye(3).double(), torch.from_numpy(cross(t[0].numpy()))[None]
         assert relative_pose(F, K, K, points1, points2)[1].isnan().all()
         for part, sign in ((slice(10), 1.0), (slice(-10, None), -1.0)):
-            assert pose_error(*relative_pose(F, K, K, points1[:, part], points2[:, part]), K, sign * t) < 1e-6
+            assert pose_error(*relative_pose(F, K, K, points1[:, part], points2[:, part]), K[None], sign * t) < 1e-6
 
     def test_exceptions(self):
         for change, error, message in [
