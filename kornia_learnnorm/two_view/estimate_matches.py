@@ -59,9 +59,8 @@ def estimate_matches(
     """Return the fundamental matrix or homography of matches, with cameras the pose, a predicted error and warnings.
 
     The result is a homography if the matches do not determine a fundamental matrix, as on a plane or when the camera
-    only rotates, see :func:`~kornia_learnnorm.two_view.model_choice.choose_model`. If less than half of the matches are
-    inliers, RANSAC searches again among those near its matrix. If one homography explains most inliers, the fundamental
-    matrix from this homography and the parallax of the other matches is tried as well.
+    only rotates, see :func:`~kornia_learnnorm.two_view.model_choice.choose_model`. If one homography explains most
+    inliers, the fundamental matrix from this homography and the parallax of the other matches is tried as well.
 
     Args:
         points1: pixels in image 1 with shape (N, 2), an array or a tensor of numbers. Rows that are not finite, or more

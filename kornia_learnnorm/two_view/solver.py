@@ -100,7 +100,7 @@ class TwoViewSolver:
         """Return the fundamental matrix of the matches without a look at parts of them."""
         if self.layer is None:
             found = self._ransac()
-            F_mat, weights = self._search_near(found.F_mat), found.inliers.double()
+            F_mat, weights = found.F_mat, found.inliers.double()
         else:
             with torch.no_grad():
                 estimate = self.layer.estimate(self.points1[None], self.points2[None], scores=self.scores[None])
