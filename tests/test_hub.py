@@ -28,7 +28,7 @@ def test_a_layer_returns_from_a_folder(layer_class, name, tmp_path):
     loaded = hub.HubModel.from_pretrained(tmp_path)
     values = [torch.rand(2, 9, 2) * 600, torch.rand(2, 9, 2) * 600]
     values += [torch.eye(3)] * 2 if layer_class is kln.LearnedRelativePose else []
-    values = [*torch.rand(2, 2, 1, 40, 60), *values] if layer_class is kln.MatchRefiner else values
+    values = [*torch.rand(2, 2, 1, 600, 600), *values] if layer_class is kln.MatchRefiner else values
     assert type(loaded.layer) is layer_class
     assert not loaded.training
     assert loaded.layer.trained_on == layer.trained_on
