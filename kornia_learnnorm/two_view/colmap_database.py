@@ -124,7 +124,7 @@ def export_colmap(
         raise FileNotFoundError(f"{len(missing)} of {len(names)} images are not in {images}, the first is {missing[0]}")
     camera, pairs = _colmap_camera(K), _read_pairs(store, images, turned)
     doubts: tuple[PairWarning, ...] = ()
-    if camera is not None and pairs:
+    if camera is not None and pairs and len(pairs[0].scores):
         matrix, (points1, points2) = torch.from_numpy(camera), map(torch.from_numpy, pairs[0].points)
         doubts = find_camera_doubt((matrix, matrix), pairs[0].sizes, points1, points2, None, threshold)
     with atomic_write(path) as temporary:
