@@ -25,7 +25,7 @@ def full_disk_names(path: str | Path) -> Iterator[None]:
 
 @contextmanager
 def explained(message: str, *kinds: type[Exception]) -> Iterator[None]:
-    """Let errors of some kinds be a ValueError that a message begins; without kinds all errors, each with its kind."""
+    """Raise errors of some kinds as a ValueError that begins with a message; without kinds any, with its class."""
     caught = kinds or (Exception,)
     try:
         yield

@@ -17,7 +17,7 @@ from kornia_learnnorm.geometry.checks import needs_gradient
 from kornia_learnnorm.models.two_view_model import Residuals, State, TwoViewModel
 
 FIRST_DAMPING = 1e-3  # of the diagonal of the normal matrix, added to it in the first step
-PLAIN_STEPS = 10  # from then on a step is as long as it and those that would follow
+PLAIN_STEPS = 10  # steps before they are lengthened
 MIN_RATE, MAX_RATE = -0.5, 0.9  # of the length of a step over that of the one before
 MAX_DAMPING = 1e8  # no step that is damped this much changes the cost by more than rounding
 MIN_PIVOT = 1e-5  # smallest diagonal entry of the Hessian's Cholesky factor, of unit rows, where it is definite
