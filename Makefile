@@ -32,10 +32,12 @@ TORCH ?= $$(grep '^torch==' requirements.lock)
 .PHONY: bench weights demo test test-cpus test-oldest test-newest lint docs audit wheel check-wheel check-extras clean ablations layer-ablations size-ablations pose-ablations refiner-ablations table1
 
 # The lock pins everything. torch goes first and alone, so that no other package's range can choose another build. Python
-# compiles what is imported; compiling all modules here would take longer than unpacking them.
+# compiles what is imported; compiling all modules here would take longer than unpacking them. The pip that comes with an
+# older Python needs twice the time.
 $(VENV)/.ready: requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, got " + sys.version)'
 	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --no-compile $$(grep '^torch==' requirements.lock)
 	$(BIN)/python -m pip install --quiet --no-compile --requirement requirements.lock
 	$(BIN)/python -m pip install --quiet --no-compile --no-deps --no-build-isolation --editable .

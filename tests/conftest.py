@@ -38,7 +38,8 @@ DEVICES = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
 
 
 def pytest_collection_modifyitems(items):
-    """Mark the tests that compare numbers, by their folder or file."""
+    """Mark the tests that compare numbers, by their folder or file; long tests go first, so that none is the last."""
+    items.sort(key=lambda item: item.get_closest_marker("long") is None)
     for item in items:
         numerical = item.path.is_relative_to(TESTS) and NUMERICAL & {*item.path.relative_to(TESTS).parts}
         if numerical and not re.search(STEADY, item.nodeid):

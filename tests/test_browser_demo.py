@@ -18,6 +18,7 @@ from kornia_learnnorm import estimate_pair
 from kornia_learnnorm.data.synthetic.render import render_pair, write_pair
 
 demo = pytest.importorskip("kornia_learnnorm.browser_demo", reason="Gradio is not installed")
+pytestmark = pytest.mark.long
 K = "576,576,319.5,239.5"  # of the example
 
 

@@ -14,6 +14,7 @@ from kornia_learnnorm.estimators import fundamental_stages, homography_stages, p
 from kornia_learnnorm.layer_export import export_layer, export_networks, load_layer
 from kornia_learnnorm.pretrained import shipped_weights
 
+pytestmark = pytest.mark.long
 SIZES = [(1, 9), (5, 64), (1, 300)]
 
 # Loads programs and runs them on stored inputs, where this package and Kornia cannot be imported.
@@ -80,20 +81,16 @@ def check_gradients_of_program(program, layer, *points, **given) -> None:
     torch.testing.assert_close(*found, rtol=1e-3, atol=1e-6)
 
 
-def test_any_batch_and_number_of_points_also_without_the_package(tmp_path, monkeypatch):
+def test_any_batch_and_number_of_points(monkeypatch):
     monkeypatch.setattr(fundamental_stages, "LOCAL_STEPS", 1)
     layer = shaken_estimator(stages=1, depth=1, refine_steps=1, samples=8)
-    program = export_layer(layer, ["mask", "scores"])
-    run, cases = program.module(), []
+    run = export_layer(layer, ["mask", "scores"]).module()
     for batch_size, num_points in SIZES:  # the first set has eight correspondences, the last one all rows
         mask = torch.arange(num_points) < torch.linspace(8, num_points, batch_size).long()[:, None]
         points, given = sets(batch_size, num_points), {"mask": mask, "scores": torch.rand(batch_size, num_points)}
         check(run, layer, *points, **given)
         eight = layer(*(p[:1, :8] for p in points), scores=given["scores"][:1, :8])
         assert up_to_sign(run(*points, **given)[0][:1], eight.detach()) < 1e-5
-        cases.append((points, given, estimates(layer, *points, **given)))
-    torch.export.save(program, tmp_path / "layer.pt2")
-    check_without_the_package(tmp_path / "layer.pt2", cases, tmp_path)
     with pytest.raises(AssertionError, match=r"points1.size\(\)\[1\] >= 9"):
         run(*sets(2, 8), mask=torch.ones(2, 8, dtype=torch.bool), scores=torch.ones(2, 8))
     assert not any(value.requires_grad for value in run(points[0].requires_grad_(), points[1], **given))
@@ -109,19 +106,22 @@ def test_siblings(cls, kind, monkeypatch):
         check(program, layer, *sets(*size, kind), scores=torch.rand(size))
 
 
-def test_weights_mask_and_gradients():
+def test_weights_mask_and_gradients_also_without_the_package(tmp_path):
     network = kln.CrossViewNetwork(width=8, depth=1)
     layer, points = kln.EightPoint(shaken(kln.LearnedNormalizer(kln.Whitening(), network))), sets(4, 8)
     points[0][2] = points[0][2, :1]  # coincident
     mask, weights = torch.ones(4, 8, dtype=torch.bool), torch.rand(4, 8) + 0.5
     mask[3, 5:] = False
-    program = export_layer(layer, ["weights", "mask"], num_points=8, gradients=True).module()
-    assert program(*points, mask=mask, weights=weights)[1].tolist() == [True, True, False, False]
+    run = export_layer(layer, ["weights", "mask"], num_points=8, gradients=True).module()
+    assert run(*points, mask=mask, weights=weights)[1].tolist() == [True, True, False, False]
     determined, given = [p[:2] for p in points], {"mask": mask[:2], "weights": weights[:2]}
-    check(program, layer, *determined, **given)
-    check_gradients_of_program(program, layer, *determined, **given)
-    layer = kln.EightPoint(kln.Whitening())  # of larger sets
-    check_gradients_of_program(export_layer(layer, gradients=True).module(), layer, *sets(3, 20))
+    check(run, layer, *determined, **given)
+    check_gradients_of_program(run, layer, *determined, **given)
+    layer, points = kln.EightPoint(kln.Whitening()), sets(3, 20)
+    program = export_layer(layer, gradients=True)
+    check_gradients_of_program(program.module(), layer, *points)
+    torch.export.save(program, tmp_path / "layer.pt2")
+    check_without_the_package(tmp_path / "layer.pt2", [(points, {}, estimates(layer, *points))], tmp_path)
 
 
 @pytest.mark.slow

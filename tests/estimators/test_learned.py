@@ -309,7 +309,7 @@ def test_scores_of_few_matches_get_a_gradient_of_zero(kind, few):
 def test_vmap_and_compile_agree(kind, monkeypatch):
     """The traced graph is whole; how fast its code is, is another question. Export has a test of its own."""
     monkeypatch.setattr(pose_stages, "LOCAL_STEPS", 1)
-    layer, values = LAYERS[kind](refine_steps=2), inputs(kind, 2, 20)
+    layer, values = LAYERS[kind](refine_steps=1, samples=4), inputs(kind, 2, 20)
     expected = layer(*values).detach()
     mapped = torch.func.vmap(lambda *rows: layer(*(row[None] for row in rows))[0])(*values)
     assert up_to_sign(mapped.detach(), expected) < 1e-6
