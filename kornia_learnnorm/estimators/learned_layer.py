@@ -10,9 +10,9 @@ import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
 
-from kornia_learnnorm.estimators.fundamental_stages import SQUARE_FLOOR
 from kornia_learnnorm.estimators.linear import solve_linear
 from kornia_learnnorm.estimators.matches import MatchLayer
+from kornia_learnnorm.estimators.moments import SQUARE_FLOOR
 from kornia_learnnorm.estimators.network_features import POINT_FEATURES, RESIDUAL_FEATURES, CommonFrame
 from kornia_learnnorm.estimators.set_network import SetWeightingNetwork
 from kornia_learnnorm.estimators.stages import TRANSFORM_PARAMS, Refinement, in_pieces, run_stages

@@ -8,7 +8,6 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
 from kornia_learnnorm.estimators.camera_evidence import contradict_cameras, keeps_fit
-from kornia_learnnorm.estimators.cheirality import in_front_of_best_pose
 from kornia_learnnorm.estimators.moments import Evidence, descend, geometric_scale, least_cost, pick
 from kornia_learnnorm.estimators.network_features import (
     POINT_FEATURES,
@@ -180,7 +179,7 @@ def _most_consistent(
     number = E_mat.shape[1]
     repeated = Essential(*(C.repeat_interleave(number, 0) for C in (model.C1, model.C2)))
     state, square = repeated.calibrated(E_mat.flatten(0, 1)), scale.square()[:, None]
-    front = in_front_of_best_pose(evidence, state, present[:, None], number)
+    front = evidence.in_front(state, present[:, None], number)
     options = present[:, None] * front, lambda _: square, LOCAL_STEPS, RELAXATION
     state = descend(evidence, state, *options)
     if not is_known_true(settled.all()):

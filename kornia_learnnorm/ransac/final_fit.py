@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.estimators.camera_evidence import contradict_cameras, keeps_fit
-from kornia_learnnorm.estimators.cheirality import in_front_of_best_pose
 from kornia_learnnorm.estimators.moments import Evidence
 from kornia_learnnorm.estimators.optimize import minimize
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure, Loss, Truncated
@@ -56,7 +55,7 @@ def _fit_on_manifold(scorer: PairScorer, M: Tensor, loss: Loss) -> Any:
         gains = (1 - (scorer.distances(pool) / scorer.threshold).square()).clamp(min=0).nan_to_num(0.0)
         weights = torch.ones_like(gains)
         if evidence is not None:
-            weights = in_front_of_best_pose(evidence, state, gains[None], len(pool))[0].to(gains)
+            weights = evidence.in_front(state, gains[None], len(pool))[0].to(gains)
         votes = (gains * weights).sum(-1)
         best, other = int(votes[:POOL_SIZE].argmax()), int(votes.argmax())
         best = other if float(votes[other]) > MIN_FRONT_GAIN * float(votes[best]) else best
