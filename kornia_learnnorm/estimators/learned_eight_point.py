@@ -98,9 +98,8 @@ class FundamentalRefinement(Refinement):
         losses = squares.div_(squares + square_scale.to(squares))  # of Geman and McClure
         M = torch.cat([M, least_cost(drawn, real, losses, present.gather(1, some), SHORTLIST)], 1)
         state, number = self.model.state(M.flatten(0, 1)), M.shape[1]
-        state = descend(
-            evidence, state, present[:, None].expand(-1, number, -1), lambda _: square_scale, LOCAL_STEPS, RELAXATION
-        )
+        all_alike = present[:, None].expand(-1, number, -1)
+        state = descend(evidence, state, all_alike, lambda _: square_scale, LOCAL_STEPS, RELAXATION)
         losses = evidence.losses(torch.unflatten(state.matrix(), 0, (-1, number)), square_scale)
         best: Rank2 = pick(state, (losses @ present[..., None])[..., 0].argmin(1), number)
         return best

@@ -109,10 +109,8 @@ class HomographyRefinement(Refinement):
             torch.unflatten(x.gather(2, drawn[:, None].expand(-1, 3, -1)), 2, (self.samples, -1)).permute(0, 2, 3, 1)
             for x in (self.x1, self.x2)
         )
-        M, margin = (
-            torch.unflatten(value, 0, (-1, self.samples))
-            for value in solve_four_points(x1.flatten(0, 1), x2.flatten(0, 1))
-        )
+        solved = solve_four_points(x1.flatten(0, 1), x2.flatten(0, 1))
+        M, margin = (torch.unflatten(value, 0, (-1, self.samples)) for value in solved)
         present = (inliers > 0).to(inliers)
         some = evenly_ranked(order, present, MAX_SCORED)
         few = present.gather(1, some)
@@ -227,16 +225,14 @@ class LearnedHomography(LearnedLayer):
             identity, without gradient.
         """
         problem, found = self._estimate(points1, points2, weights, mask, scores)
-        stages = tuple(HomographyStage(*stage) for stage in found)
+        stages = tuple(HomographyStage(*stage) for stage in found[: self.stages])
         probability = inlier_probability(self.model, problem, *found[-1], problem.determined).to(points1.dtype)
-        number = self.stages
-        return HomographyEstimate(stages[-1].H_mat, problem.determined, problem.gap, probability, stages[:number])
+        return HomographyEstimate(found[-1].F_mat, problem.determined, problem.gap, probability, stages)
 
     def _run(self, problem: LinearProblem, scores: Tensor | None) -> tuple[Tensor, Tensor]:
         """Run the stages from the view whose points spread less to the other: errors are not the same both ways."""
         swapped = CommonFrame.from_points(problem.points1, problem.points2, problem.present).swapped[:, None, None]
         points1, points2 = problem.points1, problem.points2
         points1, points2 = torch.where(swapped, points2, points1), torch.where(swapped, points1, points2)
-        ordered = LinearProblem.from_points(points1, points2, problem.weights, self.model)
-        M, logits = super()._run(ordered, scores)
+        M, logits = super()._run(LinearProblem.from_points(points1, points2, problem.weights, self.model), scores)
         return torch.where(swapped[..., None], unit_matrix(self.model.swap(M)), M), logits

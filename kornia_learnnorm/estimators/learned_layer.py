@@ -96,15 +96,14 @@ class LearnedLayer(MatchLayer):
 
         ValueError for another suffix, OSError if it cannot be written.
         """
-        save_module(
-            path, self, FORMAT, {"model": self.model.name} | {key: getattr(self, key) for key in self.architecture}
-        )
+        architecture = {key: getattr(self, key) for key in self.architecture}
+        save_module(path, self, FORMAT, {"model": self.model.name} | architecture)
 
     @classmethod
     def from_pretrained(cls, name: str | Path) -> Self:
         """Load a trained estimator: one that ships with the package, by name, or a safetensors file."""
 
-        def build(held: dict[str, Any]) -> LearnedLayer:
+        def build(held: dict[str, Any]) -> Self:  # type: ignore[type-var]
             architecture = cls.added | held
             model = architecture.pop("model", Fundamental.name)  # files before the name was written
             if model != cls.model_name:
@@ -114,8 +113,7 @@ class LearnedLayer(MatchLayer):
             check_architecture(architecture)
             return cls(**architecture)
 
-        layer: Self = load_module(name, FORMAT, "estimator", build, cls.model_name)  # type: ignore[assignment]
-        return layer
+        return load_module(name, FORMAT, "estimator", build, cls.model_name)
 
     def start_from(self, layer: LearnedLayer) -> Self:
         """Load the first networks of an estimator of fundamental matrices; weights of additional inputs are zero."""

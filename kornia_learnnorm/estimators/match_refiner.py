@@ -167,8 +167,7 @@ class MatchRefiner(nn.Module):
         self, image1: Tensor, image2: Tensor, views: list[Tensor], frames: tuple[Tensor, Tensor]
     ) -> tuple[Tensor, Tensor]:
         """Return half of the displacements in the frames, (B, N, 1, 2), and the logarithm of the noise, (B, N)."""
-        patches = map(self._normalized_patches, (image1, image2), views, frames)
-        displacement, log_scale = self._displacements(*patches)
+        displacement, log_scale = self._displacements(*map(self._normalized_patches, (image1, image2), views, frames))
         return 0.5 * displacement.mT[..., None, :], log_scale
 
     def _normalized_patches(self, image: Tensor, points: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
@@ -217,8 +216,7 @@ class MatchRefiner(nn.Module):
         xx, yy = xx + NOISE, yy + NOISE
         determinant = xx * yy - xy * xy
         step = torch.stack([yy * xr - xy * yr, xx * yr - xy * xr], 2) / determinant[:, :, None]
-        statistics = [(xx + yy).log(), determinant.log(), (rr + FLOOR).log()]
-        return _bounded(step, LARGEST_STEP), torch.cat(statistics, 1)
+        return _bounded(step, LARGEST_STEP), torch.cat([(xx + yy).log(), determinant.log(), (rr + FLOOR).log()], 1)
 
     def save_pretrained(self, path: str | Path) -> None:
         """Write weights and architecture to one ``.safetensors`` file, whole or not at all.

@@ -42,17 +42,15 @@ def correspondences_from_matches(
         matches, scores = _pairs_of_matches(keypoints1, matches, scores)
     if not isinstance(matches, Sequence):
         raise TypeError(f"matches must be a tensor, a list of tensors or a mapping, got {type(matches)}")
-    if not len(matches) == len(keypoints1) == len(keypoints2):
-        raise ValueError(
-            f"matches of every pair are needed, got {len(matches)} for {len(keypoints1)} and {len(keypoints2)} pairs"
-        )
+    if len(set(numbers := [len(values) for values in (matches, keypoints1, keypoints2)])) > 1:
+        raise ValueError("matches of every pair are needed, got {} for {} and {} pairs".format(*numbers))
     if scores is not None and len(scores) != len(matches):
         raise ValueError(f"scores of every pair are needed, got {len(scores)} for {len(matches)} pairs")
     for k, pairs in enumerate(matches):
         _check_pairs(k, pairs, keypoints1.shape[1], keypoints2.shape[1])
         if scores is not None:
             _check_scores(k, scores[k], len(pairs))
-    length = max(8, *(len(pairs) for pairs in matches)) if len(matches) else 8
+    length = max([8, *map(len, matches)])
     index = pad_sequence([*matches, keypoints1.new_zeros(length, 2, dtype=torch.int64)], batch_first=True)[:-1].long()
     present = torch.tensor([len(pairs) for pairs in matches], device=index.device)
     mask = torch.arange(length, device=index.device) < present[:, None]
@@ -63,11 +61,8 @@ def correspondences_from_matches(
     )
     if scores is None:
         return Correspondences(points1, points2, None, mask)
-    padding = (
-        torch.zeros(length, dtype=scores[0].dtype, device=index.device) if len(scores) else keypoints1.new_zeros(8)
-    )
-    weights = pad_sequence([*scores, padding], batch_first=True)[:-1]
-    return Correspondences(points1, points2, weights, mask)
+    padding = (scores[0] if len(scores) else keypoints1).new_zeros(length)
+    return Correspondences(points1, points2, pad_sequence([*scores, padding], batch_first=True)[:-1], mask)
 
 
 class MatchLayer(nn.Module):

@@ -192,8 +192,7 @@ class _Matches(NamedTuple):
         if not is_known_true(settled.all()):
             state = choose(settled.repeat_interleave(number, 0), state, descend(evidence, state, *options))
         losses = evidence.losses(torch.unflatten(state.matrix(), 0, (-1, number)), square)
-        cost = (torch.where(front, losses, 1.0) @ present[..., None])[..., 0]
-        best = cost.argmin(1)
+        best = (torch.where(front, losses, 1.0) @ present[..., None])[..., 0].argmin(1)
         return pick(state, best, number), front.gather(1, best[:, None, None].expand(-1, 1, front.shape[-1]))[:, 0]
 
     def search_near(

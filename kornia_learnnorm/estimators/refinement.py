@@ -109,8 +109,8 @@ def refine_fundamental(
     state = best.state
     if torch.is_grad_enabled() and (cost.x1.requires_grad or cost.x2.requires_grad or cost.weights.requires_grad):
         state = attach_gradient(cost, best)
-    values = unit_matrix(transform_fundamental(state.matrix(), T1, T2)), before, best.cost
-    F, before, last = (value.to(points1.dtype) for value in values)
+    F = unit_matrix(transform_fundamental(state.matrix(), T1, T2))
+    F, before, last = (x.to(points1.dtype) for x in (F, before, best.cost))
     return Refinement(F, before, last, best.iterations, best.converged)
 
 
@@ -173,8 +173,7 @@ def refine_essential(
     state = Essential.of_cameras(K1.to(T1), K2.to(T2), T1, T2).calibrated(E_mat.to(T1))
     before, best = minimize(cost, state, max_iterations, tolerance)
     E, F = best.state.essential(), transform_fundamental(best.state.matrix(), T1, T2)
-    values = unit_matrix(E), unit_matrix(F), before, best.cost
-    E, F, before, last = (value.to(points1.dtype) for value in values)
+    E, F, before, last = (x.to(points1.dtype) for x in (unit_matrix(E), unit_matrix(F), before, best.cost))
     return EssentialRefinement(E, F, before, last, best.iterations, best.converged)
 
 

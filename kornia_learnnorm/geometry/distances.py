@@ -68,8 +68,7 @@ def _on_epipole(points: Tensor, F_mat: Tensor) -> Tensor:
     """Return which points :math:`(*, N, 2)` have no epipolar line :math:`F x` but for rounding."""
     x = convert_points_to_homogeneous(points)
     normal, summands = (x @ F_mat.mT)[..., :2], (x.abs() @ F_mat.abs().mT)[..., :2]
-    on_epipole: Tensor = normal.norm(dim=-1) <= EPIPOLE_TOLERANCE * summands.norm(dim=-1)
-    return on_epipole
+    return torch.le(normal.norm(dim=-1), EPIPOLE_TOLERANCE * summands.norm(dim=-1))
 
 
 def sampson_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:

@@ -59,7 +59,12 @@ def solve_rows(
     """
     if A.shape[-2] == 8:
         return _null_vector_of_eight(A, weights)
-    h, s = _smallest(A, weights, product or _gram_product(A, weights))
+
+    def gram_product(v: Tensor) -> Tensor:
+        residual = A @ v[..., None]
+        return (A.mT @ (residual if weights is None else residual * weights[..., None]))[..., 0]
+
+    h, s = _smallest(A, weights, product or gram_product)
     return h, s[..., 7] / (s[..., 0] + (s[..., 0] == 0))
 
 
@@ -101,8 +106,7 @@ def _eliminate(A: Tensor) -> tuple[Tensor, Tensor]:
     least = torch.finfo(A.dtype).eps * pivots.amax(-1, keepdim=True)
     diagonal.copy_(torch.where(pivots < least, least + (least == 0), diagonal))
     last = torch.eye(9, dtype=A.dtype, device=A.device)[:, 8:].expand(*A.shape[:-2], 9, 1)
-    h = torch.linalg.lu_solve(LU, permutation, last, adjoint=True)[..., 0]
-    return normalize(h, dim=-1), pivots[..., :8]
+    return normalize(torch.linalg.lu_solve(LU, permutation, last, adjoint=True)[..., 0], dim=-1), pivots[..., :8]
 
 
 def null_space(A: Tensor) -> tuple[Tensor, Tensor]:
@@ -132,16 +136,6 @@ def nearest_null_vector(A: Tensor, preferred: Tensor) -> Tensor:
     zero = torch.ones_like(Vh[..., 0], dtype=torch.bool)  # the ninth of eight rows is zero
     zero[..., :8] = s[..., :8] <= MAX_ZERO_VALUE * s[..., :1]
     return normalize(Vh.mT @ (zero * (Vh @ preferred))[..., None], dim=-2).squeeze(-1)
-
-
-def _gram_product(A: Tensor, weights: Tensor | None) -> Callable[[Tensor], Tensor]:
-    """Return the product of vectors with ``A^T W A``."""
-
-    def product(v: Tensor) -> Tensor:
-        residual = A @ v[..., None]
-        return (A.mT @ (residual if weights is None else residual * weights[..., None]))[..., 0]
-
-    return product
 
 
 def _smallest(A: Tensor, weights: Tensor | None, product: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:

@@ -211,5 +211,4 @@ def hartley_coordinates(points: Tensor, weights: Tensor | None = None) -> tuple[
     shift_x, shift_y = (origin * -scale[..., None]).unbind(-1)
     zero, one = torch.zeros_like(scale), torch.ones_like(scale)
     entries = torch.stack([scale, zero, shift_x, zero, scale, shift_y, zero, zero, one], -1)
-    homogeneous = pad(centred * scale[..., None, None], (0, 0, 0, 1), value=1.0)
-    return homogeneous.mT, torch.unflatten(entries, -1, (3, 3))
+    return pad(centred * scale[..., None, None], (0, 0, 0, 1), value=1.0).mT, torch.unflatten(entries, -1, (3, 3))

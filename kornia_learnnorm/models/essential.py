@@ -7,7 +7,7 @@ relative pose.
 """
 
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple, Self
+from typing import Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -46,10 +46,9 @@ class Essential(Fundamental):
 
     def constrain(self, M: Tensor) -> Tensor:
         """Return the matrices of the nearest essential matrices."""
-        F_mat: Tensor = self.state(M).matrix()
-        return F_mat
+        return self.state(M).matrix()
 
-    def state(self, M: Tensor) -> Any:
+    def state(self, M: Tensor) -> "Calibrated":
         """Return the nearest essential matrices of unit norm."""
         inverse1, inverse2 = (torch.linalg.inv_ex(C)[0] for C in (self.C1, self.C2))
         return self.calibrated(inverse2.mT @ M @ inverse1)

@@ -163,8 +163,7 @@ class Fundamental(TwoViewModel):
 
     def is_degenerate(self, state: Any) -> Tensor:
         """Return which matrices have rank 1."""
-        degenerate: Tensor = torch.linalg.det(state.A).abs() < MIN_RANK2_DETERMINANT
-        return degenerate
+        return torch.lt(torch.linalg.det(state.A).abs(), MIN_RANK2_DETERMINANT)
 
 
 class Rank2(NamedTuple):

@@ -302,9 +302,8 @@ def _sampson(M: Tensor, x1: Tensor, x2: Tensor, weights: Tensor | None) -> tuple
     pull = k2 * e[:, 0] / a + q * by_c
     zero = torch.zeros_like(a)
     e1, e2 = torch.stack([k1, -k2 * q], 1), torch.stack([zero, k2], 1)
-    da, db, dc = (
-        torch.stack(pair, 1) for pair in ((first / (-2 * a), pull * q), (zero, -pull - q * by_c), (zero, by_c))
-    )
+    by_abc = (first / (-2 * a), pull * q), (zero, -pull - q * by_c), (zero, by_c)
+    da, db, dc = (torch.stack(pair, 1) for pair in by_abc)
     x = x1[:, None]
     row1 = e1[:, :, None] * x + pad(2 * da[:, :, None] * G[:, :1] + db[:, :, None] * G[:, 1:], (0, 0, 0, 1))
     row2 = e2[:, :, None] * x + pad(db[:, :, None] * G[:, :1] + 2 * dc[:, :, None] * G[:, 1:], (0, 0, 0, 1))

@@ -20,8 +20,7 @@ from kornia_learnnorm.models.two_view_model import TwoViewModel
 from kornia_learnnorm.normalizers.closed_form import Hartley
 from kornia_learnnorm.normalizers.normalizer import Normalizer, check_normalizer
 from kornia_learnnorm.ransac.arguments import check_matches, check_numbers
-from kornia_learnnorm.ransac.final_fit import fit_final
-from kornia_learnnorm.ransac.local_optimization import optimize_locally
+from kornia_learnnorm.ransac.fits import fit_final, optimize_locally
 from kornia_learnnorm.ransac.minimal_solver import solve_minimal_samples
 from kornia_learnnorm.ransac.samplers import Sampler, UniformSampler, WeightedSampler
 from kornia_learnnorm.ransac.scoring import MAX_MEDIAN_DISTANCES, Hypotheses, PairScorer, finite_and_bounded
@@ -215,26 +214,22 @@ class RANSAC(nn.Module):
             stack.enter_context(without_autocast(points1))
             # Inference mode is faster, but what a normaliser keeps of it would be of no use in training.
             stack.enter_context(torch.inference_mode() if self.normalizer is None else torch.no_grad())
-            result = self._estimate(points1, points2, weights, cameras, least)
+            kept = torch.ones_like(points1[:, 0], dtype=torch.bool)
+            # Not "larger": one may be NaN.
+            if not torch.maximum(points1.abs().max(), points2.abs().max()) <= MAX_MEDIAN_DISTANCES * self.inl_th:
+                kept = finite_and_bounded(points1, points2, self.inl_th)
+            best = distinct_points(points1[kept], points2[kept], None if weights is None else weights[kept])
+            kept = kept.masked_scatter(kept, best)
+            weights = None if weights is None else weights[kept]
+            result = self._estimate(points1[kept], points2[kept], weights, cameras, least)
+            inliers = torch.zeros_like(kept).masked_scatter(kept, result.inliers)
         E_mat = None if result.E_mat is None else result.E_mat.clone()
-        return result._replace(F_mat=result.F_mat.clone(), inliers=result.inliers.clone(), E_mat=E_mat)
+        return result._replace(F_mat=result.F_mat.clone(), inliers=inliers.clone(), E_mat=E_mat)
 
     def _estimate(
         self, points1: Tensor, points2: Tensor, weights: Tensor | None, cameras: Cameras | None, least: int
     ) -> RansacResult:
-        """Estimate from the matches that count: finite, bounded, and one on each point."""
-        kept = torch.ones_like(points1[:, 0], dtype=torch.bool)
-        if not torch.maximum(points1.abs().max(), points2.abs().max()) <= MAX_MEDIAN_DISTANCES * self.inl_th:  # or NaN
-            kept = finite_and_bounded(points1, points2, self.inl_th)
-        best = distinct_points(points1[kept], points2[kept], None if weights is None else weights[kept])
-        kept = kept.masked_scatter(kept, best)
-        weights = None if weights is None else weights[kept]
-        result = self._estimate_kept(points1[kept], points2[kept], weights, cameras, least)
-        return result._replace(inliers=torch.zeros_like(kept).masked_scatter(kept, result.inliers))
-
-    def _estimate_kept(
-        self, points1: Tensor, points2: Tensor, weights: Tensor | None, cameras: Cameras | None, least: int
-    ) -> RansacResult:
+        """Estimate from matches that are finite, bounded, and one on each point."""
         if (len(points1) if weights is None else int((weights > 0).sum())) < least:
             return _failure(points1, 0, cameras)
         x1, x2 = (points.to(solve_dtype(points.device)) for points in (points1, points2))

@@ -58,8 +58,7 @@ class PairScorer:
         origin = both.median(-1, keepdim=True).values
         centred = both - origin
         spread = centred.abs().flatten(1).median(-1).values.clamp_(min=threshold)[:, None, None]
-        x = torch.cat([centred, spread.expand_as(centred[:, :1])], 1)
-        self.x1, self.x2 = x
+        self.x1, self.x2 = torch.cat([centred, spread.expand_as(centred[:, :1])], 1)
         columns = torch.eye(3, 2, dtype=both.dtype, device=both.device).expand(2, 3, 2)
         self.T1, self.T2 = torch.cat([columns, torch.cat([-origin, spread], 1)], 2)
         self.terms = model.score_terms(self.x1[:, rows], self.x2[:, rows]).float()
