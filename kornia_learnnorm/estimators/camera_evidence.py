@@ -6,7 +6,7 @@ from torch import Tensor
 from kornia_learnnorm.estimators.moments import Evidence
 from kornia_learnnorm.estimators.optimize import UNROLLED_LOSS
 from kornia_learnnorm.geometry.checks import safe_divisor
-from kornia_learnnorm.geometry.row_moments import normal_equations, row_products
+from kornia_learnnorm.geometry.dlt import normal_equations, row_products
 from kornia_learnnorm.models.essential import Calibrated, Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 

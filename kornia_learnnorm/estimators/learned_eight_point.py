@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ from kornia_learnnorm.estimators.stages import Refinement
 from kornia_learnnorm.estimators.weighted_samples import evenly_ranked, fit_samples, sample_null_spaces
 from kornia_learnnorm.geometry.checks import check_cameras, check_whole_number, is_known_true
 from kornia_learnnorm.geometry.seven_point import fundamental_in_span
-from kornia_learnnorm.models.fundamental import Fundamental, Rank2
+from kornia_learnnorm.models.fundamental import Fundamental, Rank2, Rank2Method
 
 COMPARED_SCALE, FIT_SCALE = 2.2, 3.0  # of comparisons and of fits on moments, in geometric means of the distances
 LAST_FLOOR = 0.002  # of the frame's unit, about half a pixel, added to the last scale
@@ -189,7 +189,7 @@ class LearnedEightPoint(LearnedLayer):
         depth: int = 4,
         stages: int = 2,
         learn_transforms: bool = True,
-        rank2: Literal["projection", "optimal"] = "projection",
+        rank2: Rank2Method = "projection",
         refine_steps: int = 10,
         samples: int = 96,
     ) -> None:

@@ -16,13 +16,7 @@ from kornia_learnnorm.estimators.moments import SQUARE_FLOOR
 from kornia_learnnorm.estimators.network_features import POINT_FEATURES, RESIDUAL_FEATURES, CommonFrame
 from kornia_learnnorm.estimators.set_network import SetWeightingNetwork
 from kornia_learnnorm.estimators.stages import TRANSFORM_PARAMS, Refinement, in_pieces, run_stages
-from kornia_learnnorm.geometry.checks import (
-    check_tensor,
-    check_whole_number,
-    inference_mode,
-    read_condition,
-    weighted_mean,
-)
+from kornia_learnnorm.geometry import checks
 from kornia_learnnorm.geometry.problem import LinearProblem, prepare_problem, solve_where_determined
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.models.two_view_model import TwoViewModel
@@ -63,8 +57,8 @@ class LearnedLayer(MatchLayer):
     ) -> None:
         super().__init__()
         for name, number in {"width": width, "depth": depth, "stages": stages}.items():
-            check_whole_number(name, number, 1)
-        check_whole_number("refine_steps", refine_steps, 0)
+            checks.check_whole_number(name, number, 1)
+        checks.check_whole_number("refine_steps", refine_steps, 0)
         if not isinstance(learn_transforms, bool):
             raise ValueError(f"learn_transforms must be true or false, got {learn_transforms!r}")
         self.model, self.width, self.depth, self.stages = model, width, depth, stages
@@ -134,7 +128,7 @@ class LearnedLayer(MatchLayer):
 
         def solve(problem: LinearProblem, rows: Tensor | None) -> tuple[Tensor, ...]:
             given = scores if scores is None or rows is None else scores[rows]
-            with inference_mode():
+            with checks.inference_mode():
                 pieces = [self._run(*piece) for piece in in_pieces(problem, given)]
             return tuple(map(torch.cat, zip(*pieces, strict=True)))
 
@@ -169,7 +163,7 @@ def inlier_probability(
     x1, x2 = torch.where(swapped, x2, x1), torch.where(swapped, x1, x2)
     squares = model.squares(model.residual(M / torch.linalg.matrix_norm(M, keepdim=True), x1, x2))
     weights = present if problem.weights is None else problem.weights
-    mean = weighted_mean((squares + SQUARE_FLOOR)[..., None].log(), prior.sigmoid() * weights).exp()
+    mean = checks.weighted_mean((squares + SQUARE_FLOOR)[..., None].log(), prior.sigmoid() * weights).exp()
     variance = mean * VARIANCE[model.components]
     evidence = model.components * (LOG_RANGE - variance.log() / 2) - squares / (2 * variance)
     enough = determined & (present.sum(1) >= MIN_JUDGED)
@@ -178,11 +172,11 @@ def inlier_probability(
 
 def check_scores(scores: Tensor, points1: Tensor, mask: Tensor | None) -> Tensor:
     """Return the scores, zero where masked; raise a clear error for scores outside of 0 to 1 or of a wrong shape."""
-    check_tensor("scores", scores)
+    checks.check_tensor("scores", scores)
     if scores.shape != points1.shape[:-1]:
         raise ValueError(f"scores must have shape {[*points1.shape[:-1]]}, got {[*scores.shape]}")
     scores = scores if mask is None else torch.where(mask, scores, 0.0)
-    if read_condition(~((scores >= 0) & (scores <= 1)).all()):
+    if checks.read_condition(~((scores >= 0) & (scores <= 1)).all()):
         low, high = scores.aminmax()
         raise ValueError(f"scores must be between 0 and 1, got {low.item():.9g} to {high.item():.9g}")
     return scores

@@ -11,12 +11,7 @@ from torch import Tensor
 from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.estimators.learned_layer import LearnedLayer, check_scores, inlier_probability
 from kornia_learnnorm.estimators.optimize import choose
-from kornia_learnnorm.estimators.pose_stages import (
-    POSE_OUTPUTS,
-    POSE_POINT_FEATURES,
-    POSE_RESIDUAL_FEATURES,
-    run_pose_stages,
-)
+from kornia_learnnorm.estimators.pose_stages import run_pose_stages
 from kornia_learnnorm.estimators.stages import in_pieces
 from kornia_learnnorm.geometry.checks import check_cameras, check_whole_number, inference_mode, is_known_true
 from kornia_learnnorm.geometry.dlt import MIN_GAP
@@ -92,7 +87,8 @@ class LearnedRelativePose(LearnedLayer):
 
     model_name = Essential.name
     architecture = ("width", "depth", "stages", "refine_steps", "samples")
-    features, residual_features, outputs = POSE_POINT_FEATURES, POSE_RESIDUAL_FEATURES, POSE_OUTPUTS
+    features, residual_features = LearnedLayer.features + 5, LearnedLayer.residual_features + 1
+    outputs = 1  # the logarithm of the robust scale's factor
 
     def __init__(
         self, width: int = 48, depth: int = 4, stages: int = 2, refine_steps: int = 5, samples: int = 64

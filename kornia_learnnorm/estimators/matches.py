@@ -1,7 +1,7 @@
 r"""Padded batches of correspondences from the output of matching networks."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -111,9 +111,7 @@ class MatchLayer(nn.Module):
             raise ValueError(f"{type(self).__name__} takes no cameras, got {' and '.join(cameras)}")
         return self.estimate(points1, points2, mask=mask, **cameras, **{self.scores_are: weights})
 
-    def __prepare_scriptable__(self) -> NoReturn:
-        """Raise a TypeError: ``torch.jit`` is not supported."""
-        refuse_jit()
+    __prepare_scriptable__ = staticmethod(refuse_jit)
 
 
 def _keypoints(name: str, keypoints: Keypoints) -> Tensor:

@@ -15,11 +15,12 @@ from torch import Tensor
 
 from kornia_learnnorm.estimators.optimize import choose
 from kornia_learnnorm.geometry.checks import safe_divisor
-from kornia_learnnorm.geometry.row_moments import ENTRIES, normal_equations, point_products, row_moments, row_products
+from kornia_learnnorm.geometry.dlt import ENTRIES, normal_equations, point_products, row_moments, row_products
 from kornia_learnnorm.models.essential import Calibrated
 
 SQUARE_FLOOR = 1e-10  # of the frame's unit squared, added to squared distances before their logarithm
 NORMAL_FLOOR = 1e-4  # of the norm of the matrix, added to that of each line's normal
+SquareScale = Callable[[Tensor], Tensor]  # from squared distances (B, S, N) to the squared scale of a loss
 
 
 class Evidence(NamedTuple):
@@ -94,12 +95,7 @@ class Evidence(NamedTuple):
 
 
 def descend(
-    evidence: Evidence,
-    state: Any,
-    weights: Tensor,
-    square_scale: Callable[[Tensor], Tensor],
-    steps: int,
-    relaxation: float = 1.0,
+    evidence: Evidence, state: Any, weights: Tensor, square_scale: SquareScale, steps: int, relaxation: float = 1.0
 ) -> Any:
     r"""Return the states of matrices, S of each set, after steps of reweighted least squares; differentiable.
 
@@ -133,9 +129,7 @@ def descend(
     return state
 
 
-def geometric_scale(
-    inliers: Tensor, dof: int, floor: Tensor | float, near: float | None = None
-) -> Callable[[Tensor], Tensor]:
+def geometric_scale(inliers: Tensor, dof: int, floor: Tensor | float, near: float | None = None) -> SquareScale:
     r"""Return the function from squared distances (B, S, N) to their squared scale (B, S, 1).
 
     It is the geometric mean over correspondences weighted by ``inliers`` (B, N), times :math:`n / (n - p)` of

@@ -1,6 +1,5 @@
 r"""The stages of the learned relative pose: features, logits, moment matrix, essential matrices, robust steps."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -8,27 +7,19 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
 from kornia_learnnorm.estimators.camera_evidence import contradict_cameras, keeps_fit
-from kornia_learnnorm.estimators.moments import Evidence, descend, geometric_scale, least_cost, pick
-from kornia_learnnorm.estimators.network_features import (
-    POINT_FEATURES,
-    RESIDUAL_FEATURES,
-    CommonFrame,
-    match_features,
-    residual_features,
-)
+from kornia_learnnorm.estimators.moments import Evidence, SquareScale, descend, geometric_scale, least_cost, pick
+from kornia_learnnorm.estimators.network_features import CommonFrame, match_features, residual_features
 from kornia_learnnorm.estimators.optimize import choose, differentiable_state
 from kornia_learnnorm.estimators.stages import few_outliers
 from kornia_learnnorm.estimators.weighted_samples import evenly_ranked, sample_null_spaces
 from kornia_learnnorm.geometry.checks import is_known_true, safe_divisor
+from kornia_learnnorm.geometry.dlt import row_moments, row_products
 from kornia_learnnorm.geometry.five_point import essential_in_span
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem
-from kornia_learnnorm.geometry.row_moments import row_moments, row_products
 from kornia_learnnorm.models.essential import Calibrated, Essential, nearest_essential
 from kornia_learnnorm.models.fundamental import Fundamental
 
-POSE_POINT_FEATURES, POSE_RESIDUAL_FEATURES = POINT_FEATURES + 5, RESIDUAL_FEATURES + 1
-POSE_OUTPUTS = 1  # of a stage's network for the whole set: the logarithm of the robust scale's factor
 EARLY_STEPS, LOCAL_STEPS = 2, 3  # reweightings in all stages but the last, and of candidates, twice if not settled
 # Scales of the robust loss in geometric means of the distances: of all stages but the last and of the last, times the
 # network's factor, and of settled sets.
@@ -135,7 +126,7 @@ class _Matches(NamedTuple):
         F_mat = self.model.C2.mT[:, None] @ E_mat @ self.model.C1[:, None]
         return self.evidence.single().losses(F_mat.float(), scale.square()[:, None])
 
-    def square_scale(self, inliers: Tensor, scale: Tensor, near: float | None) -> Callable[[Tensor], Tensor]:
+    def square_scale(self, inliers: Tensor, scale: Tensor, near: float | None) -> SquareScale:
         """Return the function from squared distances (B, S, N) to the squared scale (B, S, 1) of the loss.
 
         The scale (B, 1) is in geometric means of the distances, weighted by the probabilities of inliers.
@@ -211,9 +202,7 @@ class _Matches(NamedTuple):
         found, found_front = self.most_consistent(near, near, best, samples, settled)
         return choose(again, found, state), torch.where(again[:, None], found_front, front)
 
-    def leave_cameras(
-        self, state: Calibrated, weights: Tensor, square_scale: Callable[[Tensor], Tensor], steps: int
-    ) -> Calibrated:
+    def leave_cameras(self, state: Calibrated, weights: Tensor, square_scale: SquareScale, steps: int) -> Calibrated:
         """Return the states, but the poses of fundamental matrices where correspondences contradict the cameras."""
         evidence, model, unit = self
         with torch.no_grad():

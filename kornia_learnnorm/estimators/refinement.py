@@ -1,6 +1,6 @@
 r"""Non-linear refinement of fundamental and essential matrices on distances in pixels, by Levenberg-Marquardt."""
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
@@ -9,13 +9,12 @@ from torch import Tensor
 from kornia_learnnorm.estimators.optimize import RobustCost, attach_gradient, minimize
 from kornia_learnnorm.estimators.robust_losses import Loss, check_loss, squared_loss
 from kornia_learnnorm.geometry.checks import check_cameras, check_correspondences, check_matrices, solve_dtype
+from kornia_learnnorm.geometry.distances import Distance
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import hartley_coordinates
 from kornia_learnnorm.geometry.transforms import transform_fundamental
 from kornia_learnnorm.models.essential import Essential
 from kornia_learnnorm.models.fundamental import Fundamental
-
-Distance = Literal["sampson", "symmetric"]
 
 
 class Refinement(NamedTuple):

@@ -7,12 +7,13 @@ relative pose.
 """
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
 
 from kornia_learnnorm.geometry.constrained_fit import Fit, Loss
+from kornia_learnnorm.geometry.distances import Distance
 from kornia_learnnorm.geometry.dlt import design_matrix
 from kornia_learnnorm.geometry.five_point import essential_in_span
 from kornia_learnnorm.models.fundamental import Fundamental, Rank2
@@ -32,15 +33,13 @@ class Essential(Fundamental):
     sample_size = 5
     confidence = 0.999  # cameras leave noise less room
 
-    def __init__(self, C1: Tensor, C2: Tensor, distance: Literal["sampson", "symmetric"] = "sampson") -> None:
+    def __init__(self, C1: Tensor, C2: Tensor, distance: Distance = "sampson") -> None:
         super().__init__(distance=distance)
         # Of unit norm, so that the fundamental matrices have a norm of about one too.
         self.C1, self.C2 = (C / torch.linalg.matrix_norm(C, keepdim=True) for C in (C1, C2))
 
     @classmethod
-    def of_cameras(
-        cls, K1: Tensor, K2: Tensor, T1: Tensor, T2: Tensor, distance: Literal["sampson", "symmetric"] = "sampson"
-    ) -> Self:
+    def of_cameras(cls, K1: Tensor, K2: Tensor, T1: Tensor, T2: Tensor, distance: Distance = "sampson") -> Self:
         """Return the model of pixels after transforms, of cameras and transforms that broadcast to (B, 3, 3)."""
         return cls(torch.linalg.inv_ex(T1 @ K1)[0], torch.linalg.inv_ex(T2 @ K2)[0], distance)
 

@@ -6,7 +6,7 @@ it.
 """
 
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -14,8 +14,9 @@ from torch.nn.functional import normalize, pad
 
 from kornia_learnnorm.geometry.checks import check_choice, safe_divisor
 from kornia_learnnorm.geometry.constrained_fit import Fit, Loss
+from kornia_learnnorm.geometry.distances import Distance
+from kornia_learnnorm.geometry.dlt import normal_equations
 from kornia_learnnorm.geometry.matrices import cofactors, determinant, inverse
-from kornia_learnnorm.geometry.row_moments import normal_equations
 from kornia_learnnorm.models.two_view_model import TwoViewModel
 
 IDENTITY = (3**-0.5, 0.0, 0.0, 0.0, 3**-0.5, 0.0, 0.0, 0.0, 3**-0.5)
@@ -46,7 +47,7 @@ class Homography(TwoViewModel):
     preferred: tuple[float, ...] = IDENTITY
     confidence, max_batch, pool_size, prescored = 0.9999, 4096, 4, 256  # samples of four are cheap
 
-    def __init__(self, distance: Literal["sampson", "symmetric"] = "sampson") -> None:
+    def __init__(self, distance: Distance = "sampson") -> None:
         check_choice("distance", distance, ("sampson", "symmetric"))
         self.distance, self.components = distance, 2 if distance == "sampson" else 4
 

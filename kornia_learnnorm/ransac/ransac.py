@@ -10,11 +10,12 @@ from torch import Tensor, nn
 
 from kornia_learnnorm.estimators.linear import solve_linear
 from kornia_learnnorm.geometry.checks import check_cameras, check_choice, solve_dtype, without_autocast
+from kornia_learnnorm.geometry.distances import Distance
 from kornia_learnnorm.geometry.distinct_points import distinct_points
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.essential import Essential
-from kornia_learnnorm.models.fundamental import Fundamental
+from kornia_learnnorm.models.fundamental import Fundamental, Rank2Method
 from kornia_learnnorm.models.homography import Homography
 from kornia_learnnorm.models.two_view_model import TwoViewModel
 from kornia_learnnorm.normalizers.closed_form import Hartley
@@ -119,8 +120,8 @@ class RANSAC(nn.Module):
         max_samples: int = 50_000,
         max_seconds: float | None = None,
         confidence: float | None = None,
-        distance: Literal["sampson", "symmetric"] = "sampson",
-        rank2: Literal["projection", "optimal"] | None = None,
+        distance: Distance = "sampson",
+        rank2: Rank2Method | None = None,
         refine: bool = True,
         seed: int | None = None,
         model: Literal["fundamental", "homography"] | TwoViewModel = "fundamental",
@@ -140,7 +141,7 @@ class RANSAC(nn.Module):
             model = Homography(distance) if model == "homography" else Fundamental(rank2, distance)
         self.model = model
         self.normalizer = Hartley() if normalizer is None and rank2 == "projection" else normalizer
-        self.rank2: Literal["projection", "optimal"] = rank2
+        self.rank2: Rank2Method = rank2
         self.inl_th, self.max_samples, self.max_seconds, self.confidence = inl_th, max_samples, max_seconds, confidence
         self.distance, self.refine = distance, refine
         self.seed = None if seed is None else int(seed)

@@ -15,6 +15,7 @@ from kornia_learnnorm.models.two_view_model import TwoViewModel
 MAX_MEDIAN_DISTANCES = 1e6  # largest distance from the median point, in median distances or thresholds
 BLOCK = 1 << 16  # distances computed at once, which stay in a core's cache
 SHORTLIST = 64  # hypotheses that are scored on all correspondences
+Rows = Tensor | slice  # of correspondences
 
 
 class Hypotheses(NamedTuple):
@@ -46,12 +47,7 @@ class PairScorer:
     """
 
     def __init__(
-        self,
-        points1: Tensor,
-        points2: Tensor,
-        threshold: float,
-        model: TwoViewModel,
-        rows: Tensor | slice = slice(None),
+        self, points1: Tensor, points2: Tensor, threshold: float, model: TwoViewModel, rows: Rows = slice(None)
     ) -> None:
         self.threshold, self.model, self.rows = threshold, model, rows
         both = torch.stack([points1.mT, points2.mT])
@@ -109,7 +105,7 @@ class PairScorer:
         """Return the distances (K, N) of all correspondences from matrices (K, 3, 3), pixels; NaN on an epipole."""
         return self.model.squares(self.model.residual(F_mat, self.x1[None], self.x2[None])).sqrt()
 
-    def cost(self, loss: Loss, rows: Tensor | slice = slice(None), weights: Tensor | None = None) -> RobustCost:
+    def cost(self, loss: Loss, rows: Rows = slice(None), weights: Tensor | None = None) -> RobustCost:
         """Return the sum of losses over some correspondences; weights (K or 1, M)."""
         x1, x2 = self.x1[None, :, rows], self.x2[None, :, rows]
         return RobustCost(self.model, x1, x2, torch.ones_like(x1[:, 0]) if weights is None else weights, loss)
