@@ -140,9 +140,7 @@ class LearnedLayer(MatchLayer):
         M, logits = solve_where_determined(problem, solve, solve_rest)
         return problem, tuple(map(StageEstimate, M.to(points1.dtype).unbind(1), logits.to(points1.dtype).unbind(1)))
 
-    def _run(self, problem: LinearProblem, scores: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return matrices (B, S, 3, 3) and logits (B, S, N) of stages and final estimate, of determined sets."""
-        return run_stages(self, problem, scores)
+    _run = run_stages
 
 
 def inlier_probability(

@@ -173,8 +173,7 @@ def find_homography(
         >>> (H_mat / H_mat[:, 2:, 2:])[0].diagonal().round(decimals=3)
         tensor([2., 2., 1.])
     """
-    H_mat: Tensor = LinearLayer(Homography(), normalizer)(points1, points2, weights, mask)
-    return H_mat
+    return LinearLayer(Homography(), normalizer).forward(points1, points2, weights, mask)
 
 
 class TwoViewEstimate(NamedTuple):

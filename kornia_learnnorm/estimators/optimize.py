@@ -176,7 +176,7 @@ def refine_unrolled(model: TwoViewModel, x1: Tensor, x2: Tensor, M: Tensor, weig
     """
     total_weight = weights.sum(1, keepdim=True)
     share = weights / (total_weight + (total_weight == 0))
-    state = differentiable_state(model, M / torch.linalg.matrix_norm(M, keepdim=True))
+    state: State = differentiable_state(model, M / torch.linalg.matrix_norm(M, keepdim=True))
     distance, J = model.linearise(state.matrix(), x1, x2, share)
     squares = distance.square() if model.components == 1 else model.squares(distance)
     geometric_mean = (share * (squares + DISTANCE_FLOOR**2).log() / 2).sum(1, keepdim=True).exp()
@@ -200,8 +200,7 @@ def refine_unrolled(model: TwoViewModel, x1: Tensor, x2: Tensor, M: Tensor, weig
         total, gradient = torch.where(better[:, 0], new_total, total), torch.where(better, new_gradient, gradient)
         normal = torch.where(better[..., None], new_normal, normal)
         damping = torch.where(better, 0.1 * damping, 10 * damping)
-    refined: Tensor = state.matrix()
-    return refined
+    return state.matrix()
 
 
 def choose(chosen: Tensor, states: Any, others: Any) -> Any:

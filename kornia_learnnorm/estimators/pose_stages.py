@@ -175,7 +175,7 @@ class _Matches(NamedTuple):
         losses = self._replace(evidence=evidence.select(some)).losses(drawn, scale)
         E_mat = torch.cat([E_mat, least_cost(drawn, real, losses, present.gather(1, some), SHORTLIST)], 1)
         number = E_mat.shape[1]
-        repeated = Essential(*(C.repeat_interleave(number, 0) for C in (model.C1, model.C2)))
+        repeated = Essential(model.C1.repeat_interleave(number, 0), model.C2.repeat_interleave(number, 0))
         state, square = repeated.calibrated(E_mat.flatten(0, 1)), scale.square()[:, None]
         front = evidence.in_front(state, present[:, None], number)
         options = present[:, None] * front, lambda _: square, LOCAL_STEPS, RELAXATION

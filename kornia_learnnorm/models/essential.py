@@ -36,7 +36,7 @@ class Essential(Fundamental):
     def __init__(self, C1: Tensor, C2: Tensor, distance: Distance = "sampson") -> None:
         super().__init__(distance=distance)
         # Of unit norm, so that the fundamental matrices have a norm of about one too.
-        self.C1, self.C2 = (C / torch.linalg.matrix_norm(C, keepdim=True) for C in (C1, C2))
+        self.C1, self.C2 = (torch.div(C, torch.linalg.matrix_norm(C, keepdim=True)) for C in (C1, C2))
 
     @classmethod
     def of_cameras(cls, K1: Tensor, K2: Tensor, T1: Tensor, T2: Tensor, distance: Distance = "sampson") -> Self:
@@ -68,8 +68,7 @@ class Essential(Fundamental):
         E_mat, real = essential_in_span(torch.unflatten(Q[..., 5:].mT, -1, (3, 3)))
         pivots = R.diagonal(dim1=-2, dim2=-1).abs()
         E_mat = E_mat[real & (pivots.amin(-1) > MIN_PIVOT * pivots.amax(-1))[:, None]]
-        F_mat: Tensor = self.C2.mT @ E_mat @ self.C1
-        return F_mat
+        return self.C2.mT @ E_mat @ self.C1
 
     def reweighted_fit(self, x1: Tensor, x2: Tensor, M: Tensor, losses: Sequence[Loss]) -> Fit | None:
         """Return None: there is no fit but Levenberg-Marquardt."""

@@ -23,7 +23,7 @@ def solve_minimal_samples(
     the DLT of the model ``linear``.
     """
     model, shift = scorer.model, MIN_SAMPLE_SHIFT * scorer.threshold
-    x1, x2 = scorer.samples(rows)
+    x1, x2 = (x[:, rows].movedim(0, -1) for x in (scorer.x1, scorer.x2))
     if normalizer is None or rows.shape[1] < model.min_points:
         M = model.solve_samples(x1, x2, shift)
         if len(M) or model is not linear:

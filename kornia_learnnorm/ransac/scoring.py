@@ -54,7 +54,7 @@ class PairScorer:
         origin = both.median(-1, keepdim=True).values
         centred = both - origin
         spread = centred.abs().flatten(1).median(-1).values.clamp_(min=threshold)[:, None, None]
-        self.x1, self.x2 = torch.cat([centred, spread.expand_as(centred[:, :1])], 1)
+        self.x1, self.x2 = torch.cat([centred, spread.expand_as(centred[:, :1])], 1).unbind(0)
         columns = torch.eye(3, 2, dtype=both.dtype, device=both.device).expand(2, 3, 2)
         self.T1, self.T2 = torch.cat([columns, torch.cat([-origin, spread], 1)], 2)
         self.terms = model.score_terms(self.x1[:, rows], self.x2[:, rows]).float()
@@ -70,10 +70,6 @@ class PairScorer:
     def pixels(self) -> tuple[Tensor, Tensor]:
         """Correspondences in pixels, (N, 2) for each view."""
         return (self.x1[:2] - self.T1[:2, 2:]).mT, (self.x2[:2] - self.T2[:2, 2:]).mT
-
-    def samples(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Return samples (K, M) of all correspondences in the scorer's coordinates, (K, M, 3)."""
-        return self.x1[:, rows].movedim(0, -1), self.x2[:, rows].movedim(0, -1)
 
     def from_pixels(self, F_mat: Tensor) -> Tensor:
         """Return matrices (K, 3, 3) of pixels in the scorer's coordinates."""
