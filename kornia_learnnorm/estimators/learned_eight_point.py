@@ -63,9 +63,8 @@ class FundamentalRefinement(Refinement):
         weights = probability if self.weights is None else probability * self.weights
         evidence, mean = Evidence.from_points(self.x1, self.x2), geometric_scale(weights, self.model.dof, SQUARE_FLOOR)
         with torch.no_grad():
-            own = descend(
-                evidence, self.model.state(M), weights[:, None], lambda s: FIT_SCALE**2 * mean(s), FIRST_STEPS
-            ).matrix()
+            state = self.model.state(M)
+            own = descend(evidence, state, weights[:, None], lambda s: FIT_SCALE**2 * mean(s), FIRST_STEPS).matrix()
             best = self._most_consistent(evidence, torch.stack([own, M], 1), weights, mean)
         state = Rank2(best.axes + 0.0 * M[:, None], best.A)
         power = probability.clamp(min=torch.finfo(M.dtype).tiny) ** LAST_POWER

@@ -104,12 +104,9 @@ class HomographyRefinement(Refinement):
         """Return the matrices of least cost, (B, 1, 3, 3), among own ones and those of minimal samples."""
         # Matches in the order of their weights: samples and choices don't depend on the order that they came in.
         order = inliers.argsort(dim=1, descending=True, stable=True)
-        drawn = draw_matches(inliers, order, self.samples, self.model.sample_size)
-        x1, x2 = (
-            torch.unflatten(x.gather(2, drawn[:, None].expand(-1, 3, -1)), 2, (self.samples, -1)).permute(0, 2, 3, 1)
-            for x in (self.x1, self.x2)
-        )
-        solved = solve_four_points(x1.flatten(0, 1), x2.flatten(0, 1))
+        drawn = draw_matches(inliers, order, self.samples, self.model.sample_size)[:, None].expand(-1, 3, -1)
+        views = (torch.unflatten(x.gather(2, drawn), 2, (self.samples, -1)) for x in (self.x1, self.x2))
+        solved = solve_four_points(*(x.permute(0, 2, 3, 1).flatten(0, 1) for x in views))
         M, margin = (torch.unflatten(value, 0, (-1, self.samples)) for value in solved)
         present = (inliers > 0).to(inliers)
         some = evenly_ranked(order, present, MAX_SCORED)

@@ -63,10 +63,8 @@ class LearnedLayer(MatchLayer):
             raise ValueError(f"learn_transforms must be true or false, got {learn_transforms!r}")
         self.model, self.width, self.depth, self.stages = model, width, depth, stages
         self.learn_transforms, self.refine_steps = learn_transforms, refine_steps
-        self.networks = nn.ModuleList(
-            SetWeightingNetwork(self.features + (self.residual_features if stage else 0), width, depth, self.outputs)
-            for stage in range(stages)
-        )
+        sizes = [self.features] + (stages - 1) * [self.features + self.residual_features]
+        self.networks = nn.ModuleList(SetWeightingNetwork(size, width, depth, self.outputs) for size in sizes)
         self.detach_stages = False
         self.trained_on: tuple[str, ...] = ()
 

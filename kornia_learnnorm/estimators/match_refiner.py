@@ -134,9 +134,8 @@ class MatchRefiner(nn.Module):
             checks.check_mask(mask, points1, points2)
             views = [torch.where(mask[..., None], points, 0.0) for points in views]
         checks.check_correspondences(views[0], views[1], min_points=0)
-        for name, image in (("image1", image1), ("image2", image2)):
-            _check_image(name, image, len(points1))
         for number, (image, points) in enumerate(zip((image1, image2), views, strict=True), 1):
+            _check_image(f"image{number}", image, len(points1))
             _check_inside(number, image, points)
         dtype = self.shift.weight.dtype
         if dtype not in (torch.float32, torch.float64):

@@ -54,11 +54,10 @@ def correspondences_from_matches(
     index = pad_sequence([*matches, keypoints1.new_zeros(length, 2, dtype=torch.int64)], batch_first=True)[:-1].long()
     present = torch.tensor([len(pairs) for pairs in matches], device=index.device)
     mask = torch.arange(length, device=index.device) < present[:, None]
-    points1, points2 = (
-        # A view without any keypoint gets one at the origin: padded rows take the first.
-        pad(keypoints, (0, 0, 0, int(keypoints.shape[1] == 0))).gather(1, index[..., k : k + 1].expand(-1, -1, 2))
-        for k, keypoints in enumerate((keypoints1, keypoints2))
-    )
+    # A view without any keypoint gets one at the origin: padded rows take the first.
+    views = (pad(keypoints, (0, 0, 0, int(keypoints.shape[1] == 0))) for keypoints in (keypoints1, keypoints2))
+    matched = zip(views, index.unbind(-1), strict=True)
+    points1, points2 = (view.gather(1, rows[..., None].expand(-1, -1, 2)) for view, rows in matched)
     if scores is None:
         return Correspondences(points1, points2, None, mask)
     padding = (scores[0] if len(scores) else keypoints1).new_zeros(length)

@@ -146,10 +146,8 @@ def solve_where_determined(
         solutions = solve(problem.with_generic_points(determined), None)
         with torch.no_grad():
             others = solve_undetermined(problem)
-        return tuple(
-            torch.where(determined.view(-1, *[1] * (value.ndim - 1)), value, other)
-            for value, other in zip(solutions, others, strict=True)
-        )
+        pairs = zip(solutions, others, strict=True)
+        return tuple(torch.where(determined.view(-1, *[1] * (value.ndim - 1)), value, other) for value, other in pairs)
     found, rest = determined.nonzero()[:, 0], (~determined).nonzero()[:, 0]
     with torch.no_grad():
         others = solve_undetermined(problem.select(rest))

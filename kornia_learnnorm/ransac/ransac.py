@@ -2,7 +2,7 @@ r"""RANSAC for fundamental matrices, essential matrices and homographies."""
 
 import math
 import time
-from contextlib import ExitStack
+from contextlib import nullcontext
 from typing import Literal, NamedTuple
 
 import torch
@@ -203,18 +203,15 @@ class RANSAC(nn.Module):
         """
         check_cameras(K1, K2)
         if K1 is not None and not isinstance(self.model, Fundamental):
-            raise ValueError(
-                f"K1 and K2 make a fundamental matrix an essential one, got a {self.model.name}: leave them out"
-            )
+            text = f"K1 and K2 make a fundamental matrix an essential one, got a {self.model.name}"
+            raise ValueError(f"{text}: leave them out")
         cameras = None if K1 is None or K2 is None else (K1, K2)
         least = self.model.min_points if cameras is None else Essential.sample_size
         check_matches(points1, points2, weights, least)
-        with ExitStack() as stack:
-            if points1.device.type == "cpu":
-                stack.enter_context(one_thread())
-            stack.enter_context(without_autocast(points1))
-            # Inference mode is faster, but what a normaliser keeps of it would be of no use in training.
-            stack.enter_context(torch.inference_mode() if self.normalizer is None else torch.no_grad())
+        threads = one_thread() if points1.device.type == "cpu" else nullcontext()
+        # Inference mode is faster, but what a normaliser keeps of it would be of no use in training.
+        gradients = torch.inference_mode() if self.normalizer is None else torch.no_grad()
+        with threads, without_autocast(points1), gradients:
             kept = torch.ones_like(points1[:, 0], dtype=torch.bool)
             # Not "larger": one may be NaN.
             if not torch.maximum(points1.abs().max(), points2.abs().max()) <= MAX_MEDIAN_DISTANCES * self.inl_th:
