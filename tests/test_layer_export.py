@@ -10,7 +10,7 @@ from references import signless, up_to_sign
 from scenes import inputs, raises, shaken, shaken_estimator
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.estimators import fundamental_stages, homography_stages, pose_stages
+from kornia_learnnorm.estimators import learned_eight_point, learned_homography, pose_stages
 from kornia_learnnorm.layer_export import export_layer, export_networks, load_layer
 from kornia_learnnorm.pretrained import shipped_weights
 
@@ -82,7 +82,7 @@ def check_gradients_of_program(program, layer, *points, **given) -> None:
 
 
 def test_any_batch_and_number_of_points(monkeypatch):
-    monkeypatch.setattr(fundamental_stages, "LOCAL_STEPS", 1)
+    monkeypatch.setattr(learned_eight_point, "LOCAL_STEPS", 1)
     layer = shaken_estimator(stages=1, depth=1, refine_steps=1, samples=8)
     run = export_layer(layer, ["mask", "scores"]).module()
     for batch_size, num_points in SIZES:  # the first set has eight correspondences, the last one all rows
@@ -98,7 +98,7 @@ def test_any_batch_and_number_of_points(monkeypatch):
 
 @pytest.mark.parametrize(("cls", "kind"), [(kln.LearnedRelativePose, "pose"), (kln.LearnedHomography, "homography")])
 def test_siblings(cls, kind, monkeypatch):
-    for part, name in ((pose_stages, "EARLY_STEPS"), (pose_stages, "LOCAL_STEPS"), (homography_stages, "LOCAL_STEPS")):
+    for part, name in ((pose_stages, "EARLY_STEPS"), (pose_stages, "LOCAL_STEPS"), (learned_homography, "LOCAL_STEPS")):
         monkeypatch.setattr(part, name, 1)
     layer = cls(width=8, depth=1, stages=1, refine_steps=1, samples=4)
     program = export_layer(layer, ["scores"]).module()

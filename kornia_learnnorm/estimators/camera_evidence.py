@@ -6,7 +6,7 @@ from torch import Tensor
 from kornia_learnnorm.estimators.moments import Evidence
 from kornia_learnnorm.estimators.optimize import UNROLLED_LOSS
 from kornia_learnnorm.geometry.checks import safe_divisor
-from kornia_learnnorm.geometry.row_moments import normal_equations, row_products
+from kornia_learnnorm.geometry.dlt import normal_equations, row_products
 from kornia_learnnorm.models.essential import Calibrated, Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 
@@ -53,8 +53,7 @@ def contradict_cameras(evidence: Evidence, state: Calibrated, weights: Tensor, s
     freedom = (inner.sum(1) - Fundamental.dof).clamp(min=1.0)
     effect = (gains[1] - gains[0]) * inner.sum(1) / noise / freedom
     least = (SIGNIFICANCE ** (-2 / freedom) - 1).clamp(min=MIN_EFFECT)
-    contradicted: Tensor = (effect > least) & (variances[0] > MIN_PRECISION * variances[1])
-    return contradicted
+    return torch.logical_and(effect > least, variances[0] > MIN_PRECISION * variances[1])
 
 
 @torch.no_grad()
@@ -68,5 +67,4 @@ def keeps_fit(
     """
     losses = evidence.losses(torch.stack([state.matrix(), other.matrix()], 1), square_scale[:, None])
     fit = ((1 - losses) @ weights[..., None])[..., 0]
-    kept: Tensor = fit[:, 1] > MIN_KEPT * fit[:, 0]
-    return kept
+    return torch.gt(fit[:, 1], MIN_KEPT * fit[:, 0])

@@ -2,20 +2,34 @@ r"""The learned homography: from matches of a plane, or of a camera that only ro
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.estimators.homography_stages import HomographyRefinement
 from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.estimators.learned_layer import LearnedLayer, inlier_probability
+from kornia_learnnorm.estimators.moments import SQUARE_FLOOR, geometric_scale, least_cost
 from kornia_learnnorm.estimators.network_features import CommonFrame
+from kornia_learnnorm.estimators.optimize import UNROLLED_LOSS
+from kornia_learnnorm.estimators.stages import Refinement
+from kornia_learnnorm.estimators.weighted_samples import draw_matches, evenly_ranked
 from kornia_learnnorm.geometry.checks import check_whole_number
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem
-from kornia_learnnorm.models.homography import Homography
+from kornia_learnnorm.models.homography import Homography, solve_four_points, squared_distances
+
+# Of the robust loss, in geometric means of the inliers' distances: of early stages, comparisons and the last fit.
+EARLY_SCALE, COMPARED_SCALE, LAST_SCALE = 3.0, 1.5, 6.0
+NEAR = 3.0  # geometric means, up to about which distances count in the mean itself in evaluation
+LAST_POWER = 0.05  # of the probabilities in the last fit: most matches are to count, and a robust loss drops outliers
+LOCAL_STEPS = 2  # reweightings of candidates
+MAX_SCORED = 128  # matches by which candidates are compared
+SHORTLIST = 2  # matrices of minimal samples that are refined
+MIN_MARGIN = 1e-3  # of the frame's unit, by which a minimal sample has to miss being degenerate
+MIN_MATCHES = 8  # from which samples are drawn: among few, some fit most of them by chance
 
 
 class HomographyStage(NamedTuple):
@@ -34,6 +48,90 @@ class HomographyEstimate(NamedTuple):
     # Inlier probability of each correspondence, (B, N); zero for absent ones, one half in sets that are not determined.
     weights: Tensor
     stages: tuple[HomographyStage, ...]  # result of each stage before its refinement, in order
+
+
+class HomographyRefinement(Refinement):
+    r"""Reweighted least squares of a stage's homographies, and in the last stage a search among minimal samples.
+
+    Correspondences enter a step through the :math:`9 \times 9` matrix of the second moments of their design rows alone,
+    which weighted moments of view 1's points make: a step costs little for ten matches and for thousands.
+
+    Matches are weighted by the probabilities of inliers and the derivative of Geman and McClure's loss of squared
+    distances :math:`r` over a squared scale, :math:`(1 + r)^{-2}`. In the last stage these are probabilities to the
+    power of 0.05 and :math:`(1 + r^2)^{-2}`, which leaves inliers nearly equal weights; sets of at least eight matches
+    start from their refined matrix or one of minimal samples that are drawn by the probabilities of inliers, whichever
+    has the least cost of all matches, whatever their probabilities.
+    """
+
+    model: Homography
+    min_searched = MIN_MATCHES
+
+    def __init__(
+        self, model: Homography, problem: LinearProblem, frame: CommonFrame, samples: int, settle: bool
+    ) -> None:
+        super().__init__(model, problem, frame, samples, settle)
+        products = (self.x1[:, :, None] * self.x1[:, None]).flatten(1, 2)
+        self.evidence = model.sampson_terms(self.x1, self.x2), products
+
+    def optimize(self, M: Tensor, probability: Tensor, steps: int, last: bool) -> Tensor:
+        """Return the matrices after so many steps.
+
+        The choice among matrices has no derivative; through a zero, the transforms still get a gradient of zero.
+        """
+        inliers = probability if self.weights is None else probability * self.weights
+        near = NEAR if self.settle else None
+        mean, weights = geometric_scale(inliers, self.model.dof, SQUARE_FLOOR, near), inliers
+        if last:
+            weights = probability.clamp(min=torch.finfo(M.dtype).tiny) ** LAST_POWER
+            weights = weights if self.weights is None else weights * self.weights
+        M = (M / torch.linalg.matrix_norm(M, keepdim=True))[:, None]
+
+        def weigh(squares: Tensor) -> Tensor:
+            if last:
+                return weights[:, None] * UNROLLED_LOSS((squares / (LAST_SCALE**2 * mean(squares))).square())[1]
+            return weights[:, None] * UNROLLED_LOSS(squares / (EARLY_SCALE**2 * mean(squares)))[1]
+
+        if last and steps and self.samples:
+            with torch.no_grad():
+                own = self._descend(M, self.evidence, weigh, LOCAL_STEPS)
+                squares = self.model.sampson_squares(own, self.evidence[0])[0]
+                best = self._most_consistent(own, inliers, COMPARED_SCALE**2 * mean(squares))
+            few = (inliers > 0).sum(1) < MIN_MATCHES
+            M = torch.where(few[:, None, None, None], M, best + 0.0 * M)
+        return self._descend(M, self.evidence, weigh, steps)[:, 0]
+
+    def _most_consistent(self, own: Tensor, inliers: Tensor, square_scale: Tensor) -> Tensor:
+        """Return the matrices of least cost, (B, 1, 3, 3), among own ones and those of minimal samples."""
+        # Matches in the order of their weights: samples and choices don't depend on the order that they came in.
+        order = inliers.argsort(dim=1, descending=True, stable=True)
+        drawn = draw_matches(inliers, order, self.samples, self.model.sample_size)[:, None].expand(-1, 3, -1)
+        views = (torch.unflatten(x.gather(2, drawn), 2, (self.samples, -1)) for x in (self.x1, self.x2))
+        solved = solve_four_points(*(x.permute(0, 2, 3, 1).flatten(0, 1) for x in views))
+        M, margin = (torch.unflatten(value, 0, (-1, self.samples)) for value in solved)
+        present = (inliers > 0).to(inliers)
+        some = evenly_ranked(order, present, MAX_SCORED)
+        few = present.gather(1, some)
+        terms, products = (value.gather(2, some[:, None].expand(-1, value.shape[1], -1)) for value in self.evidence)
+
+        def losses(M: Tensor, terms: Tensor) -> Tensor:
+            return UNROLLED_LOSS(self.model.sampson_squares(M, terms)[0] / square_scale.to(M))[0]
+
+        def weigh(squares: Tensor) -> Tensor:
+            return few[:, None] * UNROLLED_LOSS(squares / square_scale)[1]
+
+        M = least_cost(M, margin > MIN_MARGIN, losses(M.float(), terms.float()), few, SHORTLIST)
+        M = torch.cat([own, self._descend(M, (terms, products), weigh, LOCAL_STEPS)], 1)
+        return least_cost(M, M.isfinite().all((2, 3)), losses(M, self.evidence[0]), present, 1)
+
+    def _descend(
+        self, M: Tensor, evidence: tuple[Tensor, Tensor], weigh: Callable[[Tensor], Tensor], steps: int
+    ) -> Tensor:
+        """Return the matrices (B, K, 3, 3) after steps of reweighted least squares; differentiable."""
+        terms, products = evidence
+        for _ in range(steps):
+            parts = self.model.sampson_parts(M, terms)
+            M = self.model.reweighted_step(M, terms, products, parts, weigh(squared_distances(parts)))[0]
+        return M
 
 
 class LearnedHomography(LearnedLayer):
@@ -124,16 +222,14 @@ class LearnedHomography(LearnedLayer):
             identity, without gradient.
         """
         problem, found = self._estimate(points1, points2, weights, mask, scores)
-        stages = tuple(HomographyStage(*stage) for stage in found)
+        stages = tuple(HomographyStage(*stage) for stage in found[: self.stages])
         probability = inlier_probability(self.model, problem, *found[-1], problem.determined).to(points1.dtype)
-        number = self.stages
-        return HomographyEstimate(stages[-1].H_mat, problem.determined, problem.gap, probability, stages[:number])
+        return HomographyEstimate(found[-1].F_mat, problem.determined, problem.gap, probability, stages)
 
     def _run(self, problem: LinearProblem, scores: Tensor | None) -> tuple[Tensor, Tensor]:
         """Run the stages from the view whose points spread less to the other: errors are not the same both ways."""
         swapped = CommonFrame.from_points(problem.points1, problem.points2, problem.present).swapped[:, None, None]
         points1, points2 = problem.points1, problem.points2
         points1, points2 = torch.where(swapped, points2, points1), torch.where(swapped, points1, points2)
-        ordered = LinearProblem.from_points(points1, points2, problem.weights, self.model)
-        M, logits = super()._run(ordered, scores)
+        M, logits = super()._run(LinearProblem.from_points(points1, points2, problem.weights, self.model), scores)
         return torch.where(swapped[..., None], unit_matrix(self.model.swap(M)), M), logits

@@ -10,19 +10,13 @@ import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
 
-from kornia_learnnorm.estimators.fundamental_stages import SQUARE_FLOOR
 from kornia_learnnorm.estimators.linear import solve_linear
 from kornia_learnnorm.estimators.matches import MatchLayer
+from kornia_learnnorm.estimators.moments import SQUARE_FLOOR
 from kornia_learnnorm.estimators.network_features import POINT_FEATURES, RESIDUAL_FEATURES, CommonFrame
 from kornia_learnnorm.estimators.set_network import SetWeightingNetwork
 from kornia_learnnorm.estimators.stages import TRANSFORM_PARAMS, Refinement, in_pieces, run_stages
-from kornia_learnnorm.geometry.checks import (
-    check_tensor,
-    check_whole_number,
-    inference_mode,
-    read_condition,
-    weighted_mean,
-)
+from kornia_learnnorm.geometry import checks
 from kornia_learnnorm.geometry.problem import LinearProblem, prepare_problem, solve_where_determined
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.models.two_view_model import TwoViewModel
@@ -63,16 +57,14 @@ class LearnedLayer(MatchLayer):
     ) -> None:
         super().__init__()
         for name, number in {"width": width, "depth": depth, "stages": stages}.items():
-            check_whole_number(name, number, 1)
-        check_whole_number("refine_steps", refine_steps, 0)
+            checks.check_whole_number(name, number, 1)
+        checks.check_whole_number("refine_steps", refine_steps, 0)
         if not isinstance(learn_transforms, bool):
             raise ValueError(f"learn_transforms must be true or false, got {learn_transforms!r}")
         self.model, self.width, self.depth, self.stages = model, width, depth, stages
         self.learn_transforms, self.refine_steps = learn_transforms, refine_steps
-        self.networks = nn.ModuleList(
-            SetWeightingNetwork(self.features + (self.residual_features if stage else 0), width, depth, self.outputs)
-            for stage in range(stages)
-        )
+        sizes = [self.features] + (stages - 1) * [self.features + self.residual_features]
+        self.networks = nn.ModuleList(SetWeightingNetwork(size, width, depth, self.outputs) for size in sizes)
         self.detach_stages = False
         self.trained_on: tuple[str, ...] = ()
 
@@ -96,15 +88,14 @@ class LearnedLayer(MatchLayer):
 
         ValueError for another suffix, OSError if it cannot be written.
         """
-        save_module(
-            path, self, FORMAT, {"model": self.model.name} | {key: getattr(self, key) for key in self.architecture}
-        )
+        architecture = {key: getattr(self, key) for key in self.architecture}
+        save_module(path, self, FORMAT, {"model": self.model.name} | architecture)
 
     @classmethod
     def from_pretrained(cls, name: str | Path) -> Self:
         """Load a trained estimator: one that ships with the package, by name, or a safetensors file."""
 
-        def build(held: dict[str, Any]) -> LearnedLayer:
+        def build(held: dict[str, Any]) -> Self:  # type: ignore[type-var]
             architecture = cls.added | held
             model = architecture.pop("model", Fundamental.name)  # files before the name was written
             if model != cls.model_name:
@@ -114,8 +105,7 @@ class LearnedLayer(MatchLayer):
             check_architecture(architecture)
             return cls(**architecture)
 
-        layer: Self = load_module(name, FORMAT, "estimator", build, cls.model_name)  # type: ignore[assignment]
-        return layer
+        return load_module(name, FORMAT, "estimator", build, cls.model_name)
 
     def start_from(self, layer: LearnedLayer) -> Self:
         """Load the first networks of an estimator of fundamental matrices; weights of additional inputs are zero."""
@@ -136,7 +126,7 @@ class LearnedLayer(MatchLayer):
 
         def solve(problem: LinearProblem, rows: Tensor | None) -> tuple[Tensor, ...]:
             given = scores if scores is None or rows is None else scores[rows]
-            with inference_mode():
+            with checks.inference_mode():
                 pieces = [self._run(*piece) for piece in in_pieces(problem, given)]
             return tuple(map(torch.cat, zip(*pieces, strict=True)))
 
@@ -148,9 +138,7 @@ class LearnedLayer(MatchLayer):
         M, logits = solve_where_determined(problem, solve, solve_rest)
         return problem, tuple(map(StageEstimate, M.to(points1.dtype).unbind(1), logits.to(points1.dtype).unbind(1)))
 
-    def _run(self, problem: LinearProblem, scores: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return matrices (B, S, 3, 3) and logits (B, S, N) of stages and final estimate, of determined sets."""
-        return run_stages(self, problem, scores)
+    _run = run_stages
 
 
 def inlier_probability(
@@ -171,7 +159,7 @@ def inlier_probability(
     x1, x2 = torch.where(swapped, x2, x1), torch.where(swapped, x1, x2)
     squares = model.squares(model.residual(M / torch.linalg.matrix_norm(M, keepdim=True), x1, x2))
     weights = present if problem.weights is None else problem.weights
-    mean = weighted_mean((squares + SQUARE_FLOOR)[..., None].log(), prior.sigmoid() * weights).exp()
+    mean = checks.weighted_mean((squares + SQUARE_FLOOR)[..., None].log(), prior.sigmoid() * weights).exp()
     variance = mean * VARIANCE[model.components]
     evidence = model.components * (LOG_RANGE - variance.log() / 2) - squares / (2 * variance)
     enough = determined & (present.sum(1) >= MIN_JUDGED)
@@ -180,11 +168,11 @@ def inlier_probability(
 
 def check_scores(scores: Tensor, points1: Tensor, mask: Tensor | None) -> Tensor:
     """Return the scores, zero where masked; raise a clear error for scores outside of 0 to 1 or of a wrong shape."""
-    check_tensor("scores", scores)
+    checks.check_tensor("scores", scores)
     if scores.shape != points1.shape[:-1]:
         raise ValueError(f"scores must have shape {[*points1.shape[:-1]]}, got {[*scores.shape]}")
     scores = scores if mask is None else torch.where(mask, scores, 0.0)
-    if read_condition(~((scores >= 0) & (scores <= 1)).all()):
+    if checks.read_condition(~((scores >= 0) & (scores <= 1)).all()):
         low, high = scores.aminmax()
         raise ValueError(f"scores must be between 0 and 1, got {low.item():.9g} to {high.item():.9g}")
     return scores

@@ -11,12 +11,7 @@ from torch import Tensor
 from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.estimators.learned_layer import LearnedLayer, check_scores, inlier_probability
 from kornia_learnnorm.estimators.optimize import choose
-from kornia_learnnorm.estimators.pose_stages import (
-    POSE_OUTPUTS,
-    POSE_POINT_FEATURES,
-    POSE_RESIDUAL_FEATURES,
-    run_pose_stages,
-)
+from kornia_learnnorm.estimators.pose_stages import run_pose_stages
 from kornia_learnnorm.estimators.stages import in_pieces
 from kornia_learnnorm.geometry.checks import check_cameras, check_whole_number, inference_mode, is_known_true
 from kornia_learnnorm.geometry.dlt import MIN_GAP
@@ -92,7 +87,8 @@ class LearnedRelativePose(LearnedLayer):
 
     model_name = Essential.name
     architecture = ("width", "depth", "stages", "refine_steps", "samples")
-    features, residual_features, outputs = POSE_POINT_FEATURES, POSE_RESIDUAL_FEATURES, POSE_OUTPUTS
+    features, residual_features = LearnedLayer.features + 5, LearnedLayer.residual_features + 1
+    outputs = 1  # the logarithm of the robust scale's factor
 
     def __init__(
         self, width: int = 48, depth: int = 4, stages: int = 2, refine_steps: int = 5, samples: int = 64
@@ -162,22 +158,16 @@ class LearnedRelativePose(LearnedLayer):
             sets, such as fewer than five different correspondences, get the pose of a sideways motion, without
             gradient.
         """
-        problem, cameras, determined, gap, states, logits = self._pose_stages(
-            points1, points2, K1, K2, weights, mask, scores
-        )
-        dtype = points1.dtype
-        stages = tuple(
-            PoseStage(unit_matrix(state.essential()).to(dtype), logit.to(dtype))
-            for state, logit in zip(states, logits, strict=True)
-        )
+        found = self._pose_stages(points1, points2, K1, K2, weights, mask, scores)
+        (problem, cameras, determined, gap, states, logits), dtype = found, points1.dtype
+        pairs = zip(states, logits, strict=True)
+        stages = tuple(PoseStage(unit_matrix(state.essential()).to(dtype), logit.to(dtype)) for state, logit in pairs)
         state, (inverse1, inverse2) = states[-1], (torch.linalg.inv_ex(K)[0] for K in cameras)
         F_mat = unit_matrix(inverse2.mT @ state.essential() @ inverse1)
         probability = inlier_probability(Fundamental(), problem, F_mat, logits[-1], determined)
         R, t = choose_pose(*state.poses(), problem.points1, problem.points2, *cameras, probability.detach())
-        probability = probability.to(dtype)
-        return RelativePoseEstimate(
-            stages[-1].E_mat, F_mat.to(dtype), R.to(dtype), t.to(dtype), determined, gap, probability, stages
-        )
+        F_mat, R, t, probability = (value.to(dtype) for value in (F_mat, R, t, probability))
+        return RelativePoseEstimate(stages[-1].E_mat, F_mat, R, t, determined, gap, probability, stages)
 
     def _pose_stages(
         self,
@@ -205,8 +195,7 @@ class LearnedRelativePose(LearnedLayer):
             pieces = [run_pose_stages(self, *piece) for piece in in_pieces(solved, C1, C2, scores)]
         all_states, all_logits = zip(*pieces, strict=True)
         states = [Calibrated(*map(torch.cat, zip(*stage, strict=True))) for stage in zip(*all_states, strict=True)]
-        preferred = eye.new_tensor(self.model.preferred).view(1, 3, 3)
-        sideways = Essential(eye[None], eye[None]).calibrated(preferred)
+        sideways = Essential(eye[None], eye[None]).calibrated(eye.new_tensor(self.model.preferred).view(1, 3, 3))
         states = [choose(determined, state, sideways) for state in states]
         logits = [torch.where(rows, torch.cat(stage), 0.0) for stage in zip(*all_logits, strict=True)]
         return problem, (K1, K2), determined, gap, states, logits

@@ -1,7 +1,7 @@
 """Linear estimation: the DLT of a model in the coordinates of a normaliser, as a function and as a layer."""
 
 from contextlib import AbstractContextManager, nullcontext
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ from kornia_learnnorm.geometry.dlt import DEPENDENT_GAP
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem, prepare_problem, solve_where_determined
 from kornia_learnnorm.geometry.transforms import transform_fundamental
-from kornia_learnnorm.models.fundamental import Fundamental
+from kornia_learnnorm.models.fundamental import Fundamental, Rank2Method
 from kornia_learnnorm.models.homography import Homography
 from kornia_learnnorm.models.two_view_model import TwoViewModel
 from kornia_learnnorm.normalizers.closed_form import Hartley, Identity, Whitening
@@ -27,7 +27,7 @@ def find_fundamental(
     points2: Tensor,
     weights: Tensor | None = None,
     normalizer: Normalizer | None = None,
-    rank2: Literal["projection", "optimal"] = "projection",
+    rank2: Rank2Method = "projection",
 ) -> Tensor:
     r"""Compute the fundamental matrix from eight or more correspondences by the normalised eight-point algorithm.
 
@@ -173,8 +173,7 @@ def find_homography(
         >>> (H_mat / H_mat[:, 2:, 2:])[0].diagonal().round(decimals=3)
         tensor([2., 2., 1.])
     """
-    H_mat: Tensor = LinearLayer(Homography(), normalizer)(points1, points2, weights, mask)
-    return H_mat
+    return LinearLayer(Homography(), normalizer).forward(points1, points2, weights, mask)
 
 
 class TwoViewEstimate(NamedTuple):
@@ -225,9 +224,7 @@ class EightPoint(LinearLayer):
         tensor([False, False])
     """
 
-    def __init__(
-        self, normalizer: Normalizer | None = None, rank2: Literal["projection", "optimal"] = "projection"
-    ) -> None:
+    def __init__(self, normalizer: Normalizer | None = None, rank2: Rank2Method = "projection") -> None:
         super().__init__(Fundamental(rank2), normalizer)
         self.rank2 = rank2
 

@@ -9,15 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import grid_sample
 
-from kornia_learnnorm.geometry.checks import (
-    check_correspondences,
-    check_mask,
-    check_tensor,
-    check_whole_number,
-    inference_mode,
-    read_condition,
-    without_autocast,
-)
+from kornia_learnnorm.geometry import checks
 from kornia_learnnorm.pretrained import check_architecture, load_module, save_module
 
 FORMAT = "kornia_learnnorm.match_refiner.v1"
@@ -90,8 +82,8 @@ class MatchRefiner(nn.Module):
 
     def __init__(self, patch_size: int = 11, width: int = 64, bound: float = 1.5) -> None:
         super().__init__()
-        check_whole_number("patch_size", patch_size, 5)
-        check_whole_number("width", width, 1)
+        checks.check_whole_number("patch_size", patch_size, 5)
+        checks.check_whole_number("width", width, 1)
         if patch_size % 2 == 0:
             raise ValueError(f"patch_size must be odd, got {patch_size}")
         if not bound > 0:
@@ -136,21 +128,20 @@ class MatchRefiner(nn.Module):
             ValueError: if numbers of images and points differ, over a fifth of the points of a view lies outside of the
                 images, or a value is not finite or out of its range.
         """
-        check_whole_number("passes", self.passes, 1)
+        checks.check_whole_number("passes", self.passes, 1)
         views = [points1, points2]
         if mask is not None:
-            check_mask(mask, points1, points2)
+            checks.check_mask(mask, points1, points2)
             views = [torch.where(mask[..., None], points, 0.0) for points in views]
-        check_correspondences(views[0], views[1], min_points=0)
-        for name, image in (("image1", image1), ("image2", image2)):
-            _check_image(name, image, len(points1))
+        checks.check_correspondences(views[0], views[1], min_points=0)
         for number, (image, points) in enumerate(zip((image1, image2), views, strict=True), 1):
+            _check_image(f"image{number}", image, len(points1))
             _check_inside(number, image, points)
         dtype = self.shift.weight.dtype
         if dtype not in (torch.float32, torch.float64):
             raise TypeError(f"the refiner's weights must be float32 or float64, which hold pixels, got {dtype}")
         start = [points.to(dtype) for points in views]
-        with inference_mode(), without_autocast(points1):
+        with checks.inference_mode(), checks.without_autocast(points1):
             frames = local_frames(start[0], start[1], mask)
             half, log_scale = self._move(image1, image2, start, frames)
             for _ in range(self.passes - 1):
@@ -167,8 +158,7 @@ class MatchRefiner(nn.Module):
         self, image1: Tensor, image2: Tensor, views: list[Tensor], frames: tuple[Tensor, Tensor]
     ) -> tuple[Tensor, Tensor]:
         """Return half of the displacements in the frames, (B, N, 1, 2), and the logarithm of the noise, (B, N)."""
-        patches = map(self._normalized_patches, (image1, image2), views, frames)
-        displacement, log_scale = self._displacements(*patches)
+        displacement, log_scale = self._displacements(*map(self._normalized_patches, (image1, image2), views, frames))
         return 0.5 * displacement.mT[..., None, :], log_scale
 
     def _normalized_patches(self, image: Tensor, points: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
@@ -183,7 +173,7 @@ class MatchRefiner(nn.Module):
         patches = patches[:, 0] if patches.shape[1] == 1 else patches.mean(1)
         if patches.numel() and white == 1:
             low, high = patches.detach().aminmax()
-            if read_condition(~((low >= 0) & (high <= 1 + RANGE_ROUNDING))):
+            if checks.read_condition(~((low >= 0) & (high <= 1 + RANGE_ROUNDING))):
                 raise ValueError(f"images must have values from 0 to 1, got {low.item():g} to {high.item():g}")
         patches = patches - patches.mean(1, keepdim=True)
         variance = (patches * patches).mean(1, keepdim=True) / white**2 + VARIANCE_FLOOR
@@ -217,8 +207,7 @@ class MatchRefiner(nn.Module):
         xx, yy = xx + NOISE, yy + NOISE
         determinant = xx * yy - xy * xy
         step = torch.stack([yy * xr - xy * yr, xx * yr - xy * xr], 2) / determinant[:, :, None]
-        statistics = [(xx + yy).log(), determinant.log(), (rr + FLOOR).log()]
-        return _bounded(step, LARGEST_STEP), torch.cat(statistics, 1)
+        return _bounded(step, LARGEST_STEP), torch.cat([(xx + yy).log(), determinant.log(), (rr + FLOOR).log()], 1)
 
     def save_pretrained(self, path: str | Path) -> None:
         """Write weights and architecture to one ``.safetensors`` file, whole or not at all.
@@ -247,7 +236,7 @@ def _check_image(name: str, image: Tensor, number: int) -> None:
     if isinstance(image, Tensor) and image.dtype != torch.uint8 and not image.is_floating_point():
         raise TypeError(f"{name} must hold floating-point numbers from 0 to 1, or uint8, got {image.dtype}")
     if not isinstance(image, Tensor) or image.dtype != torch.uint8:
-        check_tensor(name, image, ["B", "C", "H", "W"])
+        checks.check_tensor(name, image, ["B", "C", "H", "W"])
     if image.ndim != 4 or len(image) != number or image.shape[1] not in (1, 3) or 0 in image.shape[2:]:
         raise ValueError(f"{name} must have shape [{number}, 1 or 3, H, W], got {[*image.shape]}")
 
@@ -256,7 +245,7 @@ def _check_inside(number: int, image: Tensor, points: Tensor) -> None:
     """Raise a ValueError if more than a fifth of the points (B, N, 2) lie outside of the images of a view."""
     width, height = image.shape[-1], image.shape[-2]
     outside = ((points < -1) | (points > points.new_tensor([width, height]))).any(-1)
-    if read_condition(outside.sum() > MAX_OUTSIDE * outside.numel()):
+    if checks.read_condition(outside.sum() > MAX_OUTSIDE * outside.numel()):
         text = f"{int(outside.sum())} of {outside.numel()} points{number} lie outside of image{number}"
         raise ValueError(f"{text}, {width} x {height} pixels: are they pixels of another size of it?")
 

@@ -1,7 +1,7 @@
 r"""Padded batches of correspondences from the output of matching networks."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -42,32 +42,26 @@ def correspondences_from_matches(
         matches, scores = _pairs_of_matches(keypoints1, matches, scores)
     if not isinstance(matches, Sequence):
         raise TypeError(f"matches must be a tensor, a list of tensors or a mapping, got {type(matches)}")
-    if not len(matches) == len(keypoints1) == len(keypoints2):
-        raise ValueError(
-            f"matches of every pair are needed, got {len(matches)} for {len(keypoints1)} and {len(keypoints2)} pairs"
-        )
+    if len(set(numbers := [len(values) for values in (matches, keypoints1, keypoints2)])) > 1:
+        raise ValueError("matches of every pair are needed, got {} for {} and {} pairs".format(*numbers))
     if scores is not None and len(scores) != len(matches):
         raise ValueError(f"scores of every pair are needed, got {len(scores)} for {len(matches)} pairs")
     for k, pairs in enumerate(matches):
         _check_pairs(k, pairs, keypoints1.shape[1], keypoints2.shape[1])
         if scores is not None:
             _check_scores(k, scores[k], len(pairs))
-    length = max(8, *(len(pairs) for pairs in matches)) if len(matches) else 8
+    length = max([8, *map(len, matches)])
     index = pad_sequence([*matches, keypoints1.new_zeros(length, 2, dtype=torch.int64)], batch_first=True)[:-1].long()
     present = torch.tensor([len(pairs) for pairs in matches], device=index.device)
     mask = torch.arange(length, device=index.device) < present[:, None]
-    points1, points2 = (
-        # A view without any keypoint gets one at the origin: padded rows take the first.
-        pad(keypoints, (0, 0, 0, int(keypoints.shape[1] == 0))).gather(1, index[..., k : k + 1].expand(-1, -1, 2))
-        for k, keypoints in enumerate((keypoints1, keypoints2))
-    )
+    # A view without any keypoint gets one at the origin: padded rows take the first.
+    views = (pad(keypoints, (0, 0, 0, int(keypoints.shape[1] == 0))) for keypoints in (keypoints1, keypoints2))
+    matched = zip(views, index.unbind(-1), strict=True)
+    points1, points2 = (view.gather(1, rows[..., None].expand(-1, -1, 2)) for view, rows in matched)
     if scores is None:
         return Correspondences(points1, points2, None, mask)
-    padding = (
-        torch.zeros(length, dtype=scores[0].dtype, device=index.device) if len(scores) else keypoints1.new_zeros(8)
-    )
-    weights = pad_sequence([*scores, padding], batch_first=True)[:-1]
-    return Correspondences(points1, points2, weights, mask)
+    padding = (scores[0] if len(scores) else keypoints1).new_zeros(length)
+    return Correspondences(points1, points2, pad_sequence([*scores, padding], batch_first=True)[:-1], mask)
 
 
 class MatchLayer(nn.Module):
@@ -116,9 +110,7 @@ class MatchLayer(nn.Module):
             raise ValueError(f"{type(self).__name__} takes no cameras, got {' and '.join(cameras)}")
         return self.estimate(points1, points2, mask=mask, **cameras, **{self.scores_are: weights})
 
-    def __prepare_scriptable__(self) -> NoReturn:
-        """Raise a TypeError: ``torch.jit`` is not supported."""
-        refuse_jit()
+    __prepare_scriptable__ = staticmethod(refuse_jit)
 
 
 def _keypoints(name: str, keypoints: Keypoints) -> Tensor:

@@ -15,9 +15,12 @@ from torch import Tensor
 
 from kornia_learnnorm.estimators.optimize import choose
 from kornia_learnnorm.geometry.checks import safe_divisor
-from kornia_learnnorm.geometry.row_moments import ENTRIES, normal_equations, point_products, row_moments, row_products
+from kornia_learnnorm.geometry.dlt import ENTRIES, normal_equations, point_products, row_moments, row_products
+from kornia_learnnorm.models.essential import Calibrated
 
+SQUARE_FLOOR = 1e-10  # of the frame's unit squared, added to squared distances before their logarithm
 NORMAL_FLOOR = 1e-4  # of the norm of the matrix, added to that of each line's normal
+SquareScale = Callable[[Tensor], Tensor]  # from squared distances (B, S, N) to the squared scale of a loss
 
 
 class Evidence(NamedTuple):
@@ -69,14 +72,30 @@ class Evidence(NamedTuple):
         size = (M.diagonal(dim1=-2, dim2=-1).sum(-1) + torch.finfo(M.dtype).tiny).view(-1, 1, 1)
         return M / size, (M - X) / size
 
+    def in_front(self, state: Calibrated, weights: Tensor, number: int) -> Tensor:
+        """Return which correspondences are in front of both cameras under the best of the four poses, (B, S, N) bool.
+
+        States are ``number`` of each set; the pose with the largest sum of weights (B, S or 1, N) in front is the best.
+        """
+        R, t, C1, C2 = state.rotations(), state.axes[:, 0, :, 2:], state.C1, state.C2
+
+        def times(forms: Tensor, points: Tensor) -> Tensor:
+            """Return the products of K forms of each state, (B S, K, P), with all points, (B, S, K, N)."""
+            values = torch.unflatten(forms, 0, (-1, number)).flatten(1, 2) @ points
+            return torch.unflatten(values, 1, (number, forms.shape[1]))
+
+        between = times((C2.mT[:, None] @ R @ C1[:, None]).mT.flatten(2), self.rows)  # x2^T R x1 of directions
+        along1, along2 = times(((R[:, 0] @ C1).mT @ t).mT, self.x1), times((C2.mT @ t).mT, self.x2)  # of either R
+        views = (C1, self.x1), (C2, self.x2)  # the states of a set have the same cameras
+        square1, square2 = ((C[::number] @ x).square().sum(1)[:, None, None] for C, x in views)
+        depth1, depth2 = along2 * between - along1 * square2, along2 * square1 - along1 * between
+        front = torch.cat([(depth1 > 0) & (depth2 > 0), (depth1 < 0) & (depth2 < 0)], 2)
+        best = (front.to(weights) @ weights[..., None]).argmax(2, keepdim=True)
+        return front.gather(2, best.expand(-1, -1, 1, front.shape[-1]))[:, :, 0]
+
 
 def descend(
-    evidence: Evidence,
-    state: Any,
-    weights: Tensor,
-    square_scale: Callable[[Tensor], Tensor],
-    steps: int,
-    relaxation: float = 1.0,
+    evidence: Evidence, state: Any, weights: Tensor, square_scale: SquareScale, steps: int, relaxation: float = 1.0
 ) -> Any:
     r"""Return the states of matrices, S of each set, after steps of reweighted least squares; differentiable.
 
@@ -110,9 +129,7 @@ def descend(
     return state
 
 
-def geometric_scale(
-    inliers: Tensor, dof: int, floor: Tensor | float, near: float | None = None
-) -> Callable[[Tensor], Tensor]:
+def geometric_scale(inliers: Tensor, dof: int, floor: Tensor | float, near: float | None = None) -> SquareScale:
     r"""Return the function from squared distances (B, S, N) to their squared scale (B, S, 1).
 
     It is the geometric mean over correspondences weighted by ``inliers`` (B, N), times :math:`n / (n - p)` of

@@ -50,8 +50,7 @@ class CommonFrame(NamedTuple):
         inverse = [radius, zero, x, zero, radius, y, zero, zero, one]
         T, back = torch.unflatten(torch.stack([torch.stack(entries, -1), torch.stack(inverse, -1)]), -1, (3, 3))
         x1, x2 = ((points - origin[:, None, None]) / radius[:, None, None, None]).unbind(1)
-        swapped = distances[1, :, 0].detach() > distances[1, :, 1].detach()
-        return cls(x1, x2, T, back, swapped)
+        return cls(x1, x2, T, back, distances[1, :, 0].detach() > distances[1, :, 1].detach())
 
 
 def match_features(frame: CommonFrame, scores: Tensor | None, present: Tensor | None) -> Tensor:

@@ -42,15 +42,6 @@ class RobustCost(NamedTuple):
             return self
         return self._replace(x1=self.x1[rows], x2=self.x2[rows], weights=self.weights[rows])
 
-    def rounding(self) -> Tensor:
-        """Return the weighted sum of squares that rounding alone can cause, (B or 1,)."""
-        distance = 4 * torch.finfo(self.x1.dtype).eps * (self.x1[:, 2, 0] + self.x2[:, 2, 0])
-        return distance.square() * self.weights.sum(-1)
-
-    def squares(self, M: Tensor) -> Tensor:
-        """Return the squared distances of matrices (B, 3, 3), (B, N)."""
-        return self.model.squares(self.model.residual(M, self.x1, self.x2))
-
 
 class Optimum(NamedTuple):
     """States, costs, normal equations, convergence, damping of the next steps, number of past steps, and the last."""
@@ -130,7 +121,8 @@ def _evaluate(
     diagonal = normal.diagonal(dim1=-2, dim2=-1).clamp_(min=torch.finfo(normal.dtype).tiny)
     # The cosines of the distances with their derivatives have no unit.
     flat = (gradient.square() <= tolerance**2 * size[:, None] * diagonal).all(-1)
-    converged = flat | (size <= cost.rounding())
+    rounding = 4 * torch.finfo(normal.dtype).eps * (cost.x1[:, 2, 0] + cost.x2[:, 2, 0])  # of a distance
+    converged = flat | (size <= rounding.square() * cost.weights.sum(-1))
     step = torch.zeros_like(gradient) if step is None else step
     return Optimum(state, total, normal, gradient, converged, damping, iterations, step)
 
@@ -156,7 +148,8 @@ def attach_gradient(cost: RobustCost, optimum: Optimum) -> State:
     """Return the optimum's states with the derivatives that it has by the implicit function theorem."""
     state: State = optimum.state
     step = optimum.gradient.new_zeros(optimum.gradient.shape).requires_grad_()
-    total = (cost.weights * cost.loss(cost.squares(state.retract(step).matrix()))[0]).sum()
+    residual = cost.model.residual(state.retract(step).matrix(), cost.x1, cost.x2)
+    total = (cost.weights * cost.loss(cost.model.squares(residual))[0]).sum()
     (gradient,) = torch.autograd.grad(total, step, create_graph=True)
     rows = [torch.autograd.grad(g.sum(), step, retain_graph=True)[0] for g in gradient.unbind(-1)]
     hessian = torch.stack(rows, -2).detach()
@@ -166,8 +159,7 @@ def attach_gradient(cost: RobustCost, optimum: Optimum) -> State:
     definite = (failed == 0) & (root.diagonal(dim1=-2, dim2=-1).amin(-1) > MIN_PIVOT)
     determined = (optimum.converged & definite)[:, None]
     hessian = torch.where(determined[..., None], hessian, torch.eye(step.shape[1]).to(hessian))
-    change = torch.where(determined, gradient - gradient.detach(), 0.0)
-    return state.retract(-torch.linalg.solve(hessian, change))
+    return state.retract(-torch.linalg.solve(hessian, torch.where(determined, gradient - gradient.detach(), 0.0)))
 
 
 def refine_unrolled(model: TwoViewModel, x1: Tensor, x2: Tensor, M: Tensor, weights: Tensor, steps: int) -> Tensor:
@@ -184,7 +176,7 @@ def refine_unrolled(model: TwoViewModel, x1: Tensor, x2: Tensor, M: Tensor, weig
     """
     total_weight = weights.sum(1, keepdim=True)
     share = weights / (total_weight + (total_weight == 0))
-    state = differentiable_state(model, M / torch.linalg.matrix_norm(M, keepdim=True))
+    state: State = differentiable_state(model, M / torch.linalg.matrix_norm(M, keepdim=True))
     distance, J = model.linearise(state.matrix(), x1, x2, share)
     squares = distance.square() if model.components == 1 else model.squares(distance)
     geometric_mean = (share * (squares + DISTANCE_FLOOR**2).log() / 2).sum(1, keepdim=True).exp()
@@ -208,16 +200,15 @@ def refine_unrolled(model: TwoViewModel, x1: Tensor, x2: Tensor, M: Tensor, weig
         total, gradient = torch.where(better[:, 0], new_total, total), torch.where(better, new_gradient, gradient)
         normal = torch.where(better[..., None], new_normal, normal)
         damping = torch.where(better, 0.1 * damping, 10 * damping)
-    refined: Tensor = state.matrix()
-    return refined
+    return state.matrix()
 
 
 def choose(chosen: Tensor, states: Any, others: Any) -> Any:
     """Return the states of a manifold where chosen, (B,) bool, else the other ones."""
     tensors = []
     for own, other in zip(states, others, strict=True):
-        shape = -1, *[1] * (own.ndim - 1)
-        tensors.append(own if own is other else torch.where(chosen.view(shape), own, other))
+        mask = chosen.view(-1, *[1] * (own.ndim - 1))
+        tensors.append(own if own is other else torch.where(mask, own, other))
     return type(states)(*tensors)
 
 
@@ -229,5 +220,4 @@ def differentiable_state(model: TwoViewModel, M: Tensor) -> Any:
         return state
     D, size = state.tangents(), torch.linalg.matrix_norm(state.matrix())[:, None]
     change = size * (M - M.detach()).mT.flatten(1)  # zero, but for its derivative
-    step = torch.linalg.solve_ex(D.mT @ D, D.mT @ change[..., None])[0].squeeze(-1)
-    return state.retract(step)
+    return state.retract(torch.linalg.solve_ex(D.mT @ D, D.mT @ change[..., None])[0].squeeze(-1))

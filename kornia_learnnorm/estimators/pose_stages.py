@@ -1,35 +1,25 @@
 r"""The stages of the learned relative pose: features, logits, moment matrix, essential matrices, robust steps."""
 
-from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
 from kornia_learnnorm.estimators.camera_evidence import contradict_cameras, keeps_fit
-from kornia_learnnorm.estimators.cheirality import in_front_of_best_pose
-from kornia_learnnorm.estimators.moments import Evidence, descend, geometric_scale, least_cost, pick
-from kornia_learnnorm.estimators.network_features import (
-    POINT_FEATURES,
-    RESIDUAL_FEATURES,
-    CommonFrame,
-    match_features,
-    residual_features,
-)
+from kornia_learnnorm.estimators.moments import Evidence, SquareScale, descend, geometric_scale, least_cost, pick
+from kornia_learnnorm.estimators.network_features import CommonFrame, match_features, residual_features
 from kornia_learnnorm.estimators.optimize import choose, differentiable_state
 from kornia_learnnorm.estimators.stages import few_outliers
 from kornia_learnnorm.estimators.weighted_samples import evenly_ranked, sample_null_spaces
 from kornia_learnnorm.geometry.checks import is_known_true, safe_divisor
+from kornia_learnnorm.geometry.dlt import row_moments, row_products
 from kornia_learnnorm.geometry.five_point import essential_in_span
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem
-from kornia_learnnorm.geometry.row_moments import row_moments, row_products
 from kornia_learnnorm.models.essential import Calibrated, Essential, nearest_essential
 from kornia_learnnorm.models.fundamental import Fundamental
 
-POSE_POINT_FEATURES, POSE_RESIDUAL_FEATURES = POINT_FEATURES + 5, RESIDUAL_FEATURES + 1
-POSE_OUTPUTS = 1  # of a stage's network for the whole set: the logarithm of the robust scale's factor
 EARLY_STEPS, LOCAL_STEPS = 2, 3  # reweightings in all stages but the last, and of candidates, twice if not settled
 # Scales of the robust loss in geometric means of the distances: of all stages but the last and of the last, times the
 # network's factor, and of settled sets.
@@ -65,6 +55,7 @@ def run_pose_stages(
     x1, x2 = convert_points_to_homogeneous(torch.stack([frame.x1, frame.x2])).mT.contiguous()
     model = Essential.of_cameras(K1, K2, frame.T, frame.T)
     evidence, unit = Evidence.from_points(x1, x2), frame.inverse[:, 0, 0, None]
+    matches = _Matches(evidence, model, unit)
     features = torch.cat([match_features(frame, scores, present), _rays(frame, model, x1, x2)], -1)
     states: list[Calibrated] = []
     found: list[Tensor] = []
@@ -100,28 +91,135 @@ def run_pose_stages(
         if len(found) == len(networks) or (is_known_true(settled.all()) and len(settled) > 0):
             break
         with torch.no_grad():  # the states of least weighted cost among those that the weights suggest
-            spans = _moment_spans(evidence, model, suggested[:, None])
+            spans = matches.moment_spans(suggested[:, None])
             E_mat, real = _suggested(spans, _in_spans(spans), before)
-            losses = _losses(evidence, model, E_mat, EARLY_PIXELS / unit)
+            losses = matches.losses(E_mat, EARLY_PIXELS / unit)
             state = model.calibrated(least_cost(E_mat, real, losses, weights, 1)[:, 0])
         state = model.attach(state)
-        square_scale = _square_scale(weights, early * scale, unit, near)
+        square_scale = matches.square_scale(weights, early * scale, near)
         states.append(descend(evidence, state, weights[:, None], square_scale, EARLY_STEPS, RELAXATION))
     drawn = 0 if detach_stages else layer.samples
     with torch.no_grad():
-        state, front = _most_consistent(evidence, model, unit, weights, suggested, before, drawn, settled)
-        state, front = _search_near(evidence, model, unit, weights, state, front, drawn, settled)
+        state, front = matches.most_consistent(weights, suggested, before, drawn, settled)
+        state, front = matches.search_near(weights, state, front, drawn, settled)
     state = model.attach(state)
     share = torch.where(front, power, 0.0)
     scale = torch.where(settled[:, None], SETTLED_SCALE, last * scale)
-    options = _square_scale(weights, scale, unit, near), layer.refine_steps, RELAXATION
-    state = descend(evidence, state, share[:, None], *options)
+    options = matches.square_scale(weights, scale, near), layer.refine_steps
+    state = descend(evidence, state, share[:, None], *options, RELAXATION)
     if not detach_stages:
-        state = _leave_cameras(evidence, model, state, share, unit, *options)
+        state = matches.leave_cameras(state, share, *options)
     # A settled set has gone to the last stage at once.
     states = [choose(settled, state, other) for other in states]
-    left = len(networks) - len(states)
-    return states + left * [state], found + (len(networks) - len(found)) * found[-1:]
+    return states + (len(networks) - len(states)) * [state], found + (len(networks) - len(found)) * found[-1:]
+
+
+class _Matches(NamedTuple):
+    """Correspondences in the common frame, with their cameras."""
+
+    evidence: Evidence
+    model: Essential
+    unit: Tensor  # of the frame, pixels, (B, 1)
+
+    def losses(self, E_mat: Tensor, scale: Tensor) -> Tensor:
+        """Return the losses of essential matrices (B, S, 3, 3) in float32, of a scale in the frame's unit (B, 1)."""
+        F_mat = self.model.C2.mT[:, None] @ E_mat @ self.model.C1[:, None]
+        return self.evidence.single().losses(F_mat.float(), scale.square()[:, None])
+
+    def square_scale(self, inliers: Tensor, scale: Tensor, near: float | None) -> SquareScale:
+        """Return the function from squared distances (B, S, N) to the squared scale (B, S, 1) of the loss.
+
+        The scale (B, 1) is in geometric means of the distances, weighted by the probabilities of inliers.
+        """
+        mean = geometric_scale(inliers, Essential.dof, (PIXEL_FLOOR / self.unit).square()[:, None], near)
+        return lambda squares: scale.square()[:, None] * mean(squares)
+
+    def moment_spans(self, weights: Tensor) -> Tensor:
+        """Return the likeliest four matrices of moments under weights (B, S, N), (B, S, 4, 3, 3), the best one last."""
+        carry = torch.einsum("bik,bjl->bklij", self.model.C1, self.model.C2)  # of the entries of E to those of F
+        carry = carry.flatten(3, 4).flatten(1, 2)[:, None]
+        M = row_moments(weights, row_products(self.evidence.products))
+        basis = torch.linalg.eigh(carry.mT @ M @ carry)[1][..., :4].flip(-1).mT
+        return torch.unflatten(basis, -1, (3, 3)).mT
+
+    def most_consistent(
+        self, weights: Tensor, suggested: Tensor, before: Candidates | None, samples: int, settled: Tensor
+    ) -> tuple[Calibrated, Tensor]:
+        """Return the states of least cost of all matches, whatever their weights, and which matches are in front.
+
+        Candidates come from the moments with and without weights, and from minimal samples drawn by the weights. The
+        best are fitted to all matches. A match behind a camera, (B, N) bool, costs as much as one far away.
+        """
+        (evidence, model, unit), present = self, (weights > 0).to(weights)
+        # Matches in the order of their weights: samples and choices don't depend on the order that they came in.
+        order = weights.argsort(dim=1, descending=True, stable=True)
+        scale = LAST_PIXELS / unit
+        few = (samples + 1) // 2  # are enough for a settled set
+        samples = few if is_known_true(settled.all()) else samples
+        drawn, used = sample_null_spaces(evidence, weights, order, samples, Essential.sample_size)
+        inverse1, inverse2 = (torch.linalg.inv_ex(C)[0][:, None, None] for C in (model.C1, model.C2))
+        drawn = inverse2.mT @ drawn @ inverse1
+        used = used & (~settled[:, None] | (torch.arange(samples, device=settled.device) < few))
+        spans = self.moment_spans(torch.stack([suggested, present], 1))
+        found, real = _in_spans(torch.cat([spans, drawn], 1))
+        number = 10 * spans.shape[1]
+        E_mat, drawn = found[:, :number], found[:, number:]
+        E_mat, own_real = _suggested(spans, (E_mat, real[:, :number]), before)
+        E_mat = least_cost(E_mat, own_real, self.losses(E_mat, scale), present, 2)
+        real = real[:, number:] & used.repeat_interleave(10, 1)
+        half = 5 * samples  # of the candidates
+        if is_known_true((real.sum(1) <= half).all()):  # usually true; the other half is then not scored
+            first = real.argsort(dim=1, descending=True, stable=True)[:, :half]
+            drawn, real = drawn.gather(1, first[..., None, None].expand(-1, -1, 3, 3)), real.gather(1, first)
+        some = evenly_ranked(order, present, MAX_SCORED)
+        losses = self._replace(evidence=evidence.select(some)).losses(drawn, scale)
+        E_mat = torch.cat([E_mat, least_cost(drawn, real, losses, present.gather(1, some), SHORTLIST)], 1)
+        number = E_mat.shape[1]
+        repeated = Essential(model.C1.repeat_interleave(number, 0), model.C2.repeat_interleave(number, 0))
+        state, square = repeated.calibrated(E_mat.flatten(0, 1)), scale.square()[:, None]
+        front = evidence.in_front(state, present[:, None], number)
+        options = present[:, None] * front, lambda _: square, LOCAL_STEPS, RELAXATION
+        state = descend(evidence, state, *options)
+        if not is_known_true(settled.all()):
+            state = choose(settled.repeat_interleave(number, 0), state, descend(evidence, state, *options))
+        losses = evidence.losses(torch.unflatten(state.matrix(), 0, (-1, number)), square)
+        best = (torch.where(front, losses, 1.0) @ present[..., None])[..., 0].argmin(1)
+        return pick(state, best, number), front.gather(1, best[:, None, None].expand(-1, 1, front.shape[-1]))[:, 0]
+
+    def search_near(
+        self, weights: Tensor, state: Calibrated, front: Tensor, samples: int, settled: Tensor
+    ) -> tuple[Calibrated, Tensor]:
+        """Return the states, where few matches agree with them those of a search among the matches near them."""
+        if not samples or is_known_true(settled.all()):
+            return state, front
+        pixels = self.evidence.squares(state.matrix()[:, None])[0][:, 0].sqrt() * self.unit
+        near = torch.where(pixels < NEAR_PIXELS, weights, 0.0)
+        again = ((pixels < LAST_PIXELS) & front).sum(1) < FEW_INLIERS * (weights > 0).sum(1)
+        again = again & ((near > 0).sum(1) >= MIN_NEAR) & ~settled
+        if is_known_true(~again.any()):
+            return state, front
+        best = state.essential()[:, None], torch.ones_like(again)[:, None]
+        found, found_front = self.most_consistent(near, near, best, samples, settled)
+        return choose(again, found, state), torch.where(again[:, None], found_front, front)
+
+    def leave_cameras(self, state: Calibrated, weights: Tensor, square_scale: SquareScale, steps: int) -> Calibrated:
+        """Return the states, but the poses of fundamental matrices where correspondences contradict the cameras."""
+        evidence, model, unit = self
+        with torch.no_grad():
+            square = square_scale(evidence.squares(state.matrix()[:, None])[0])[:, 0]
+            left = contradict_cameras(evidence, state, weights, square)
+        if is_known_true(~left.any()):
+            return state
+        with torch.no_grad():
+            start = Fundamental().state(state.matrix())
+        free = descend(evidence, start, weights[:, None], square_scale, steps, RELAXATION)
+        # Between directions: there the matrix has derivatives by the cameras, and unit norm.
+        eye = Essential(torch.eye(3).to(model.C1)[None], torch.eye(3).to(model.C2)[None])
+        inverse1, inverse2 = (torch.linalg.inv_ex(C)[0] for C in (model.C1, model.C2))
+        nearest = model.attach(differentiable_state(eye, unit_matrix(inverse2.mT @ free.matrix() @ inverse1)))
+        wide = square.maximum((EARLY_PIXELS / unit).square())
+        kept: Calibrated = choose(left & keeps_fit(evidence, state, nearest, weights, wide), nearest, state)
+        return kept
 
 
 def _rays(frame: CommonFrame, model: Essential, x1: Tensor, x2: Tensor) -> Tensor:
@@ -131,97 +229,6 @@ def _rays(frame: CommonFrame, model: Essential, x1: Tensor, x2: Tensor) -> Tenso
     rays = (rays[:, :, :2] / rays[:, :, 2:]).clamp(-MAX_RAY, MAX_RAY)
     unit = (frame.inverse[:, :1, :1] / 100).log().expand(-1, 1, rays.shape[-1])
     return torch.cat([rays.flatten(1, 2), unit], 1).mT
-
-
-def _losses(evidence: Evidence, model: Essential, E_mat: Tensor, scale: Tensor) -> Tensor:
-    """Return the losses of essential matrices (B, S, 3, 3) in float32, of a scale in the frame's unit (B, 1)."""
-    F_mat = model.C2.mT[:, None] @ E_mat @ model.C1[:, None]
-    return evidence.single().losses(F_mat.float(), scale.square()[:, None])
-
-
-def _most_consistent(
-    evidence: Evidence,
-    model: Essential,
-    unit: Tensor,
-    weights: Tensor,
-    suggested: Tensor,
-    before: Candidates | None,
-    samples: int,
-    settled: Tensor,
-) -> tuple[Calibrated, Tensor]:
-    """Return the states of least cost of all matches, whatever their weights, and which matches are in front.
-
-    Candidates come from the moments with and without weights, and from minimal samples drawn by the weights. The best
-    are fitted to all matches. A match behind a camera, (B, N) bool, costs as much as one far away.
-    """
-    present, scale = (weights > 0).to(weights), LAST_PIXELS / unit
-    # Matches in the order of their weights: samples and choices don't depend on the order that they came in.
-    order = weights.argsort(dim=1, descending=True, stable=True)
-    few = (samples + 1) // 2  # are enough for a settled set
-    samples = few if is_known_true(settled.all()) else samples
-    drawn, used = sample_null_spaces(evidence, weights, order, samples, Essential.sample_size)
-    inverse1, inverse2 = (torch.linalg.inv_ex(C)[0][:, None, None] for C in (model.C1, model.C2))
-    drawn = inverse2.mT @ drawn @ inverse1
-    used = used & (~settled[:, None] | (torch.arange(samples, device=settled.device) < few))
-    spans = _moment_spans(evidence, model, torch.stack([suggested, present], 1))
-    found, real = _in_spans(torch.cat([spans, drawn], 1))
-    number = 10 * spans.shape[1]
-    E_mat, drawn = found[:, :number], found[:, number:]
-    E_mat, own_real = _suggested(spans, (E_mat, real[:, :number]), before)
-    E_mat = least_cost(E_mat, own_real, _losses(evidence, model, E_mat, scale), present, 2)
-    real = real[:, number:] & used.repeat_interleave(10, 1)
-    half = 5 * samples  # of the candidates
-    if is_known_true((real.sum(1) <= half).all()):  # usually true; the other half is then not scored
-        first = real.argsort(dim=1, descending=True, stable=True)[:, :half]
-        drawn, real = drawn.gather(1, first[..., None, None].expand(-1, -1, 3, 3)), real.gather(1, first)
-    some = evenly_ranked(order, present, MAX_SCORED)
-    losses = _losses(evidence.select(some), model, drawn, scale)
-    E_mat = torch.cat([E_mat, least_cost(drawn, real, losses, present.gather(1, some), SHORTLIST)], 1)
-    number = E_mat.shape[1]
-    repeated = Essential(*(C.repeat_interleave(number, 0) for C in (model.C1, model.C2)))
-    state, square = repeated.calibrated(E_mat.flatten(0, 1)), scale.square()[:, None]
-    front = in_front_of_best_pose(evidence, state, present[:, None], number)
-    options = present[:, None] * front, lambda _: square, LOCAL_STEPS, RELAXATION
-    state = descend(evidence, state, *options)
-    if not is_known_true(settled.all()):
-        state = choose(settled.repeat_interleave(number, 0), state, descend(evidence, state, *options))
-    losses = evidence.losses(torch.unflatten(state.matrix(), 0, (-1, number)), square)
-    cost = (torch.where(front, losses, 1.0) @ present[..., None])[..., 0]
-    best = cost.argmin(1)
-    return pick(state, best, number), front.gather(1, best[:, None, None].expand(-1, 1, front.shape[-1]))[:, 0]
-
-
-def _search_near(
-    evidence: Evidence,
-    model: Essential,
-    unit: Tensor,
-    weights: Tensor,
-    state: Calibrated,
-    front: Tensor,
-    samples: int,
-    settled: Tensor,
-) -> tuple[Calibrated, Tensor]:
-    """Return the states, where few matches agree with them those of a search among the matches near them."""
-    if not samples or is_known_true(settled.all()):
-        return state, front
-    pixels = evidence.squares(state.matrix()[:, None])[0][:, 0].sqrt() * unit
-    near = torch.where(pixels < NEAR_PIXELS, weights, 0.0)
-    again = ((pixels < LAST_PIXELS) & front).sum(1) < FEW_INLIERS * (weights > 0).sum(1)
-    again = again & ((near > 0).sum(1) >= MIN_NEAR) & ~settled
-    if is_known_true(~again.any()):
-        return state, front
-    best = state.essential()[:, None], torch.ones_like(again)[:, None]
-    found, found_front = _most_consistent(evidence, model, unit, near, near, best, samples, settled)
-    return choose(again, found, state), torch.where(again[:, None], found_front, front)
-
-
-def _moment_spans(evidence: Evidence, model: Essential, weights: Tensor) -> Tensor:
-    """Return the four likeliest matrices of moments under weights (B, S, N), (B, S, 4, 3, 3), the likeliest last."""
-    carry = torch.einsum("bik,bjl->bklij", model.C1, model.C2)  # of the entries of E to those of F
-    carry = carry.flatten(3, 4).flatten(1, 2)[:, None]
-    M = row_moments(weights, row_products(evidence.products))
-    basis = torch.linalg.eigh(carry.mT @ M @ carry)[1][..., :4].flip(-1).mT
-    return torch.unflatten(basis, -1, (3, 3)).mT
 
 
 def _in_spans(spans: Tensor) -> Candidates:
@@ -238,40 +245,3 @@ def _suggested(spans: Tensor, found: Candidates, before: Candidates | None) -> C
     candidates += [] if before is None else [before]
     E_mat, real = (torch.cat(values, 1) for values in zip(*candidates, strict=True))
     return E_mat, real
-
-
-def _square_scale(inliers: Tensor, scale: Tensor, unit: Tensor, near: float | None) -> Callable[[Tensor], Tensor]:
-    """Return the function from squared distances (B, S, N) to the squared scale (B, S, 1) of the loss.
-
-    The scale (B, 1) is in geometric means of the distances, weighted by the probabilities of inliers.
-    """
-    mean = geometric_scale(inliers, Essential.dof, (PIXEL_FLOOR / unit).square()[:, None], near)
-    return lambda squares: scale.square()[:, None] * mean(squares)
-
-
-def _leave_cameras(
-    evidence: Evidence,
-    model: Essential,
-    state: Calibrated,
-    weights: Tensor,
-    unit: Tensor,
-    square_scale: Callable[[Tensor], Tensor],
-    steps: int,
-    relaxation: float,
-) -> Calibrated:
-    """Return the states, but the poses of fundamental matrices where correspondences contradict the cameras."""
-    with torch.no_grad():
-        square = square_scale(evidence.squares(state.matrix()[:, None])[0])[:, 0]
-        left = contradict_cameras(evidence, state, weights, square)
-    if is_known_true(~left.any()):
-        return state
-    with torch.no_grad():
-        start = Fundamental().state(state.matrix())
-    free = descend(evidence, start, weights[:, None], square_scale, steps, relaxation)
-    # Between directions: there the matrix has derivatives by the cameras, and unit norm.
-    eye = Essential(torch.eye(3).to(model.C1)[None], torch.eye(3).to(model.C2)[None])
-    inverse1, inverse2 = (torch.linalg.inv_ex(C)[0] for C in (model.C1, model.C2))
-    nearest = model.attach(differentiable_state(eye, unit_matrix(inverse2.mT @ free.matrix() @ inverse1)))
-    wide = square.maximum((EARLY_PIXELS / unit).square())
-    kept: Calibrated = choose(left & keeps_fit(evidence, state, nearest, weights, wide), nearest, state)
-    return kept

@@ -1,6 +1,6 @@
 r"""Non-linear refinement of fundamental and essential matrices on distances in pixels, by Levenberg-Marquardt."""
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
@@ -9,14 +9,12 @@ from torch import Tensor
 from kornia_learnnorm.estimators.optimize import RobustCost, attach_gradient, minimize
 from kornia_learnnorm.estimators.robust_losses import Loss, check_loss, squared_loss
 from kornia_learnnorm.geometry.checks import check_cameras, check_correspondences, check_matrices, solve_dtype
+from kornia_learnnorm.geometry.distances import Distance
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import hartley_coordinates
 from kornia_learnnorm.geometry.transforms import transform_fundamental
 from kornia_learnnorm.models.essential import Essential
 from kornia_learnnorm.models.fundamental import Fundamental
-from kornia_learnnorm.models.two_view_model import TwoViewModel
-
-Distance = Literal["sampson", "symmetric"]
 
 
 class Refinement(NamedTuple):
@@ -101,19 +99,18 @@ def refine_fundamental(
         >>> bool((refinement.cost < refinement.cost_before).all())
         True
     """
-    model = Fundamental(distance=distance)
-    _check(points1, points2, weights, "F_mat", F_mat, model.min_points, loss, max_iterations, tolerance)
-    cost, T1, T2 = _cost(model, points1, points2, weights, loss)
+    cost, T1, T2 = _cost(distance, points1, points2, weights, loss, Fundamental.min_points)
+    _check("F_mat", F_mat, points1, max_iterations, tolerance)
     with torch.no_grad():
         # The optimum does not depend on the coordinates in which it is sought.
         F = transform_fundamental(F_mat.to(T1), torch.linalg.inv_ex(T1)[0], torch.linalg.inv_ex(T2)[0])
-        before, best = minimize(cost, model.state(F), max_iterations, tolerance)
+        before, best = minimize(cost, Fundamental().state(F), max_iterations, tolerance)
     state = best.state
     if torch.is_grad_enabled() and (cost.x1.requires_grad or cost.x2.requires_grad or cost.weights.requires_grad):
         state = attach_gradient(cost, best)
     F = unit_matrix(transform_fundamental(state.matrix(), T1, T2))
-    dtype = points1.dtype
-    return Refinement(F.to(dtype), before.to(dtype), best.cost.to(dtype), best.iterations, best.converged)
+    F, before, last = (x.to(points1.dtype) for x in (F, before, best.cost))
+    return Refinement(F, before, last, best.iterations, best.converged)
 
 
 @torch.no_grad()
@@ -169,32 +166,19 @@ def refine_essential(
         >>> bool((refinement.cost < refinement.cost_before).all())
         True
     """
-    _check(points1, points2, weights, "E_mat", E_mat, Essential.sample_size, loss, max_iterations, tolerance)
+    cost, T1, T2 = _cost(distance, points1, points2, weights, loss, Essential.sample_size)
+    _check("E_mat", E_mat, points1, max_iterations, tolerance)
     check_cameras(K1, K2, len(E_mat))
-    cost, T1, T2 = _cost(Fundamental(distance=distance), points1, points2, weights, loss)
     state = Essential.of_cameras(K1.to(T1), K2.to(T2), T1, T2).calibrated(E_mat.to(T1))
     before, best = minimize(cost, state, max_iterations, tolerance)
     E, F = best.state.essential(), transform_fundamental(best.state.matrix(), T1, T2)
-    values = (unit_matrix(E), unit_matrix(F), before, best.cost)
-    E, F, before, last = (value.to(points1.dtype) for value in values)
+    E, F, before, last = (x.to(points1.dtype) for x in (unit_matrix(E), unit_matrix(F), before, best.cost))
     return EssentialRefinement(E, F, before, last, best.iterations, best.converged)
 
 
-def _check(
-    points1: Tensor,
-    points2: Tensor,
-    weights: Tensor | None,
-    name: str,
-    matrices: Tensor,
-    min_points: int,
-    loss: Loss,
-    max_iterations: int,
-    tolerance: float,
-) -> None:
-    check_correspondences(points1, points2, weights, min_points)
+def _check(name: str, matrices: Tensor, points1: Tensor, max_iterations: int, tolerance: float) -> None:
     shared = len(points1) == 1 and isinstance(matrices, Tensor)
     check_matrices(name, matrices, len(matrices) if shared else len(points1))
-    check_loss(loss)
     if not isinstance(max_iterations, int):
         raise TypeError(f"max_iterations must be a whole number, got {max_iterations!r}")
     if max_iterations < 0 or not tolerance >= 0:
@@ -202,9 +186,11 @@ def _check(
 
 
 def _cost(
-    model: TwoViewModel, points1: Tensor, points2: Tensor, weights: Tensor | None, loss: Loss
+    distance: Distance, points1: Tensor, points2: Tensor, weights: Tensor | None, loss: Loss, min_points: int
 ) -> tuple[RobustCost, Tensor, Tensor]:
     """Return the cost of correspondences, and the transforms from pixels to its coordinates, without gradient."""
+    check_correspondences(points1, points2, weights, min_points)
+    check_loss(loss)
     dtype = solve_dtype(points1.device)
     x1, x2 = points1.to(dtype), points2.to(dtype)
     weights = torch.ones_like(x1[..., 0]) if weights is None else weights.to(dtype)
@@ -212,4 +198,4 @@ def _cost(
         # Pixels from the centroid, and a third coordinate as large as they are: distances are those in pixels.
         T1, T2 = (T / T[:, :1, :1] for T in (hartley_coordinates(x, weights)[1] for x in (x1, x2)))
     x1, x2 = (T @ convert_points_to_homogeneous(x).mT for T, x in ((T1, x1), (T2, x2)))
-    return RobustCost(model, x1, x2, weights, loss), T1, T2
+    return RobustCost(Fundamental(distance=distance), x1, x2, weights, loss), T1, T2

@@ -75,8 +75,7 @@ class AttentiveContextBlock(nn.Module):
             update = torch.baddbmm(bias, z, (own + relative).mT)
         else:
             update = self.point(torch.cat([z, (z - mean) / deviation], -1)).add_(context)
-        out: Tensor = hidden + self.out(update.relu_())  # not in place: under autocast, `out` has half the precision
-        return out
+        return torch.add(hidden, self.out(update.relu_()))  # not in place: under autocast, it has half the precision
 
 
 def set_statistics(features: Tensor, logits: Tensor, absent: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:

@@ -157,5 +157,4 @@ def _solve_minimal(model: TwoViewModel, problem: LinearProblem, frame: CommonFra
     squares = model.squares(model.residual(best.detach(), x1, x2))
     fits = weighted_mean(squares[..., None], problem.present) < MAX_MINIMAL_DISTANCE**2
     M = torch.where(fits[..., None], best, plain)
-    unit: Tensor = M / torch.linalg.matrix_norm(M, keepdim=True)
-    return unit
+    return torch.div(M, torch.linalg.matrix_norm(M, keepdim=True))

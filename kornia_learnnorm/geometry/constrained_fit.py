@@ -10,9 +10,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.geometry.distances import sampson_scale
+from kornia_learnnorm.geometry.distances import DistanceScale, sampson_scale
+from kornia_learnnorm.geometry.dlt import point_products, row_moments, row_products
 from kornia_learnnorm.geometry.matrices import cofactors
-from kornia_learnnorm.geometry.row_moments import point_products, row_moments, row_products
 
 Loss = Callable[[Tensor], tuple[Tensor, Tensor]]  # of squared distances: values and derivatives
 
@@ -29,11 +29,7 @@ class Fit(NamedTuple):
 
 
 def constrained_fit(
-    x1: Tensor,
-    x2: Tensor,
-    F_mat: Tensor,
-    losses: Iterable[Loss],
-    scale: Callable[[Tensor, Tensor], tuple[Tensor, ...]] = sampson_scale,
+    x1: Tensor, x2: Tensor, F_mat: Tensor, losses: Iterable[Loss], scale: DistanceScale = sampson_scale
 ) -> Fit:
     r"""Return matrices (K, 3, 3) fitted to correspondences (3, N) that they share, one step for each of the losses.
 

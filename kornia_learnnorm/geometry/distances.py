@@ -6,13 +6,12 @@ distance in pixels, a function of the squared norms :math:`n_1 = \|(F^\top x_2)_
 :math:`n_2 = \|(F x_1)_{1:2}\|^2` of the epipolar lines' normals. It returns its value and its derivatives by both.
 """
 
+from collections.abc import Callable
+from typing import Literal
+
 import torch
+from kornia.geometry import epipolar
 from kornia.geometry.conversions import convert_points_to_homogeneous
-from kornia.geometry.epipolar import (
-    left_to_right_epipolar_distance,
-    right_to_left_epipolar_distance,
-    sampson_epipolar_distance,
-)
 from kornia.geometry.homography import symmetric_transfer_error
 from torch import Tensor
 
@@ -58,8 +57,8 @@ def symmetric_epipolar_distance(points1: Tensor, points2: Tensor, F_mat: Tensor)
     """
     _check(points1, points2, F_mat)
     with without_autocast(points1):
-        right = left_to_right_epipolar_distance(points1, points2, F_mat)
-        distance = right + right_to_left_epipolar_distance(points1, points2, F_mat)
+        right = epipolar.left_to_right_epipolar_distance(points1, points2, F_mat)
+        distance = right + epipolar.right_to_left_epipolar_distance(points1, points2, F_mat)
         return torch.where(_on_epipole(points1, F_mat) | _on_epipole(points2, F_mat.mT), torch.inf, distance)
 
 
@@ -68,8 +67,7 @@ def _on_epipole(points: Tensor, F_mat: Tensor) -> Tensor:
     """Return which points :math:`(*, N, 2)` have no epipolar line :math:`F x` but for rounding."""
     x = convert_points_to_homogeneous(points)
     normal, summands = (x @ F_mat.mT)[..., :2], (x.abs() @ F_mat.abs().mT)[..., :2]
-    on_epipole: Tensor = normal.norm(dim=-1) <= EPIPOLE_TOLERANCE * summands.norm(dim=-1)
-    return on_epipole
+    return torch.le(normal.norm(dim=-1), EPIPOLE_TOLERANCE * summands.norm(dim=-1))
 
 
 def sampson_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
@@ -85,7 +83,7 @@ def sampson_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
     """
     _check(points1, points2, F_mat)
     with without_autocast(points1):
-        return sampson_epipolar_distance(points1, points2, F_mat, squared=False)
+        return epipolar.sampson_epipolar_distance(points1, points2, F_mat, squared=False)
 
 
 def algebraic_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
@@ -171,4 +169,6 @@ def symmetric_scale(sq_norm1: Tensor, sq_norm2: Tensor, slopes: bool = True) -> 
     return first + second, -first / (2 * sq_norm1), -second / (2 * sq_norm2)
 
 
+Distance = Literal["sampson", "symmetric"]
+DistanceScale = Callable[[Tensor, Tensor], tuple[Tensor, ...]]
 DISTANCE_SCALES = {"sampson": sampson_scale, "symmetric": symmetric_scale}

@@ -1,4 +1,4 @@
-r"""Linear algebra of the DLT: design matrices, null vectors and null spaces.
+r"""Linear algebra of the DLT: design matrices, null vectors and null spaces, second moments of rows and steps on them.
 
 Every function is batched and has derivatives that stay finite on degenerate input.
 """
@@ -19,6 +19,7 @@ NINTH_ROW = (0.118, -0.264, 0.354, -0.028, -0.41, 0.208, -0.174, 0.444, 0.062)
 # Relative gap up to which rows are linearly dependent but for rounding.
 DEPENDENT_GAP = {dtype: 256 * torch.finfo(dtype).eps for dtype in (torch.float32, torch.float64)}
 MAX_ZERO_VALUE = 1e-10  # relative singular value up to which dependent rows have another null vector
+DAMPING = 1e-9  # of the mean diagonal of the normal matrix, added to it
 
 
 def design_matrix(x1: Tensor, x2: Tensor) -> Tensor:
@@ -59,7 +60,12 @@ def solve_rows(
     """
     if A.shape[-2] == 8:
         return _null_vector_of_eight(A, weights)
-    h, s = _smallest(A, weights, product or _gram_product(A, weights))
+
+    def gram_product(v: Tensor) -> Tensor:
+        residual = A @ v[..., None]
+        return (A.mT @ (residual if weights is None else residual * weights[..., None]))[..., 0]
+
+    h, s = _smallest(A, weights, product or gram_product)
     return h, s[..., 7] / (s[..., 0] + (s[..., 0] == 0))
 
 
@@ -101,8 +107,7 @@ def _eliminate(A: Tensor) -> tuple[Tensor, Tensor]:
     least = torch.finfo(A.dtype).eps * pivots.amax(-1, keepdim=True)
     diagonal.copy_(torch.where(pivots < least, least + (least == 0), diagonal))
     last = torch.eye(9, dtype=A.dtype, device=A.device)[:, 8:].expand(*A.shape[:-2], 9, 1)
-    h = torch.linalg.lu_solve(LU, permutation, last, adjoint=True)[..., 0]
-    return normalize(h, dim=-1), pivots[..., :8]
+    return normalize(torch.linalg.lu_solve(LU, permutation, last, adjoint=True)[..., 0], dim=-1), pivots[..., :8]
 
 
 def null_space(A: Tensor) -> tuple[Tensor, Tensor]:
@@ -132,16 +137,6 @@ def nearest_null_vector(A: Tensor, preferred: Tensor) -> Tensor:
     zero = torch.ones_like(Vh[..., 0], dtype=torch.bool)  # the ninth of eight rows is zero
     zero[..., :8] = s[..., :8] <= MAX_ZERO_VALUE * s[..., :1]
     return normalize(Vh.mT @ (zero * (Vh @ preferred))[..., None], dim=-2).squeeze(-1)
-
-
-def _gram_product(A: Tensor, weights: Tensor | None) -> Callable[[Tensor], Tensor]:
-    """Return the product of vectors with ``A^T W A``."""
-
-    def product(v: Tensor) -> Tensor:
-        residual = A @ v[..., None]
-        return (A.mT @ (residual if weights is None else residual * weights[..., None]))[..., 0]
-
-    return product
 
 
 def _smallest(A: Tensor, weights: Tensor | None, product: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
@@ -183,3 +178,42 @@ def _newton_step(v: Tensor, image: Tensor, others: Tensor, inverse_gap: Tensor) 
     """Return the vector after a step to the last eigenvector of a Gram matrix, of which ``image`` is the product."""
     image = image - (v * image).sum(-1, keepdim=True) / (v * v).sum(-1, keepdim=True) * v
     return v - (others.mT @ (inverse_gap * (others @ image[..., None])[..., 0])[..., None])[..., 0]
+
+
+def point_products(x1: Tensor, x2: Tensor) -> Tensor:
+    r"""Return the six different entries of :math:`x_1 x_1^\top`, then those of view 2, of points (\*, 3, N)."""
+    first, second = _PAIRS.to(x1.device)
+    x = torch.stack([x1, x2], -3)
+    return (x[..., first, :] * x[..., second, :]).flatten(-3, -2)
+
+
+def row_products(products: Tensor) -> Tensor:
+    r"""Return the 36 different entries of :math:`a a^\top` of rows :math:`a = x_1 \otimes x_2`, (\*, 36, N).
+
+    ``products`` (\*, 12, N) are those of :func:`point_products`.
+    """
+    first, second = products.chunk(2, -2)
+    return (first[..., :, None, :] * second[..., None, :, :]).flatten(-3, -2)
+
+
+def row_moments(weights: Tensor, products: Tensor) -> Tensor:
+    r"""Return :math:`\sum_i w_i a_i a_i^\top`, (\*, S, 9, 9), of weights (\*, S, N) and :func:`row_products`."""
+    return torch.unflatten((weights @ products.mT) @ _ROW_ENTRIES.to(weights), -1, (9, 9))
+
+
+def normal_equations(M: Tensor, pull: Tensor, tangents: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the normal matrices (B, P, P) of steps along tangents, a little damped, and the gradients (B, P, 1).
+
+    ``pull`` (B, 9, 1) is half of the derivative of the cost by the entries.
+    """
+    along = tangents.mT
+    normal = along @ M @ tangents
+    diagonal = normal.diagonal(dim1=-2, dim2=-1)
+    diagonal += DAMPING * diagonal.mean(-1, keepdim=True) + torch.finfo(M.dtype).tiny
+    return normal, along @ pull
+
+
+_PAIRS = torch.triu_indices(3, 3)
+# From the different entries of a symmetric matrix, (3, 3) and of rows (9, 9), to all of them.
+ENTRIES = torch.eye(6, dtype=torch.float64)[torch.tensor([[0, 1, 2], [1, 3, 4], [2, 4, 5]])]
+_ROW_ENTRIES = torch.einsum("pqs,abt->stpaqb", ENTRIES, ENTRIES).reshape(36, 81).contiguous()

@@ -68,10 +68,8 @@ def focal_lengths(F_mat: Tensor, principal1: Tensor, principal2: Tensor) -> Foca
         scale1, scale2 = (torch.stack([f, f, torch.ones_like(f)], -1) for f in (focal1, focal2))
         a, b, _ = _products(unit_matrix(scale2[:, :, None] * F * scale1[:, None]))  # the third is their product
         determined = real & (1 / a.abs() + 1 / b.abs() + 1 / (a * b).abs() < 2 * MAX_SENSITIVITY)
-    squares = torch.stack(
-        [torch.where(determined, -a * b / torch.where(determined, c, 1.0), 1.0) for a, b, c in products]
-    )
-    focal1, focal2 = torch.where(determined, squares.sqrt(), torch.nan).to(F_mat.dtype)
+    known = [torch.where(determined, -a * b / torch.where(determined, c, 1.0), 1.0) for a, b, c in products]
+    focal1, focal2 = torch.where(determined, torch.stack(known).sqrt(), torch.nan).to(F_mat.dtype)
     return FocalLengths(focal1, focal2, determined)
 
 

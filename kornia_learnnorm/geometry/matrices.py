@@ -53,8 +53,7 @@ def unit_matrix(M: Tensor) -> Tensor:
     large = torch.where(size >= size.amax(-1, keepdim=True) / 2, entries.sign(), 0.0)
     powers = torch.arange(8, -1, -1, dtype=M.dtype, device=M.device).exp2()  # the first outweighs all others
     sign = torch.where(large @ powers < 0, -1.0, 1.0)[..., None, None]
-    unit: Tensor = M * (sign / torch.linalg.matrix_norm(M, keepdim=True))
-    return unit
+    return torch.mul(M, sign / torch.linalg.matrix_norm(M, keepdim=True))
 
 
 def smallest_right_singular_vector(A: Tensor) -> tuple[Tensor, Tensor]:

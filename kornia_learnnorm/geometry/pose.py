@@ -82,8 +82,7 @@ def choose_pose(
 ) -> tuple[Tensor, Tensor]:
     """Return the poses (B, 3, 3) and (B, 3), of several (B, S, 3, 3) and (B, S, 3), with most weight in front."""
     with torch.no_grad():
-        votes = (in_front(R, t, K1, K2, points1, points2) * weights[:, None]).sum(-1)
-        best = votes.argmax(1)[:, None, None]
+        best = (in_front(R, t, K1, K2, points1, points2) * weights[:, None]).sum(-1).argmax(1)[:, None, None]
     return R.gather(1, best[..., None].expand(-1, 1, 3, 3))[:, 0], t.gather(1, best.expand(-1, 1, 3))[:, 0]
 
 
@@ -99,5 +98,4 @@ def in_front(R: Tensor, t: Tensor, K1: Tensor, K2: Tensor, points1: Tensor, poin
     normal = torch.linalg.cross(rays2, turned)
     depth1 = (torch.linalg.cross(t, rays2) * normal).sum(-1)  # times the squared length of the normal
     depth2 = (torch.linalg.cross(t, turned) * normal).sum(-1)
-    front: Tensor = (depth1 > 0) & (depth2 > 0)
-    return front
+    return torch.logical_and(depth1 > 0, depth2 > 0)

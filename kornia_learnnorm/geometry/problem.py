@@ -10,16 +10,7 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 from torch.nn.functional import pad
 
-from kornia_learnnorm.geometry.checks import (
-    check_correspondences,
-    check_mask,
-    check_pairs,
-    needs_gradient,
-    read_condition,
-    refuse_jit,
-    solve_dtype,
-    weighted_mean,
-)
+from kornia_learnnorm.geometry import checks
 from kornia_learnnorm.geometry.dlt import DEPENDENT_GAP, MIN_GAP, nearest_null_vector
 from kornia_learnnorm.geometry.matrices import inverse
 
@@ -47,7 +38,7 @@ class LinearProblem:
     @classmethod
     def from_points(cls, points1: Tensor, points2: Tensor, weights: Tensor | None, model: Any) -> Self:
         r"""Return the problem of correspondences, in float64 where the device has it."""
-        dtype = solve_dtype(points1.device)
+        dtype = checks.solve_dtype(points1.device)
         points = torch.stack([points1, points2]).to(dtype)
         weights = None if weights is None else weights.to(dtype)
         (x1, x2), (T1, T2) = hartley_coordinates(points, weights)
@@ -86,7 +77,7 @@ class LinearProblem:
     def _solve_between(self, x1: Tensor, x2: Tensor) -> tuple[Tensor, Tensor, bool | None]:
         """Return null matrix and gap in some coordinates, and whether all null matrices are unique."""
         h, gap = self.model.null_vector(x1, x2, self.weights)
-        all_determined = read_condition((gap > MIN_GAP).all())
+        all_determined = checks.read_condition((gap > MIN_GAP).all())
         if all_determined is False:
             rows = (gap <= DEPENDENT_GAP[gap.dtype]).nonzero()[:, 0]
             A = self.model.rows(x1[rows], x2[rows])
@@ -103,7 +94,7 @@ class LinearProblem:
             R1, R2 = torch.stack([self.T1, self.T2]) @ inverse(torch.stack([T1, T2]))
             M = self.model.carry(self.null_matrix, R1, R2)
             # A null matrix without gradient must not get one by way of Hartley's transforms either.
-            if needs_gradient(M):
+            if checks.needs_gradient(M):
                 M = torch.where((self.gap > DEPENDENT_GAP[M.dtype])[:, None, None], M, M.detach())
             return M / torch.linalg.matrix_norm(M, keepdim=True), self.gap
         rows = convert_points_to_homogeneous(torch.stack([self.points1, self.points2])).mT
@@ -155,10 +146,8 @@ def solve_where_determined(
         solutions = solve(problem.with_generic_points(determined), None)
         with torch.no_grad():
             others = solve_undetermined(problem)
-        return tuple(
-            torch.where(determined.view(-1, *[1] * (value.ndim - 1)), value, other)
-            for value, other in zip(solutions, others, strict=True)
-        )
+        pairs = zip(solutions, others, strict=True)
+        return tuple(torch.where(determined.view(-1, *[1] * (value.ndim - 1)), value, other) for value, other in pairs)
     found, rest = determined.nonzero()[:, 0], (~determined).nonzero()[:, 0]
     with torch.no_grad():
         others = solve_undetermined(problem.select(rest))
@@ -174,15 +163,15 @@ def prepare_problem(
 ) -> LinearProblem:
     """Return the problem of a layer's arguments, checked, ``least`` rows too; masked rows have weight zero."""
     if torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]
-        refuse_jit()
+        checks.refuse_jit()
     if mask is not None:
-        check_pairs(points1, points2, ["B", "N", "2"])
-        check_mask(mask, points1, points2, weights)
+        checks.check_pairs(points1, points2, ["B", "N", "2"])
+        checks.check_mask(mask, points1, points2, weights)
         points1, points2 = (torch.where(mask[..., None], points, 0.0) for points in (points1, points2))
         weights = mask.to(points1) if weights is None else torch.where(mask, weights, 0.0)
-    check_correspondences(points1, points2, weights, model.min_points if least is None else least)
+    checks.check_correspondences(points1, points2, weights, model.min_points if least is None else least)
     if weights is not None:
-        weights = weights.to(solve_dtype(points1.device))
+        weights = weights.to(checks.solve_dtype(points1.device))
         # Scaled where the largest would over- or underflow; sets with none above 1e-30 get zeros.
         top = weights.detach().amax(-1, keepdim=True)
         weights = torch.where(top < 1e-30, 0.0, weights)
@@ -200,16 +189,15 @@ def hartley_coordinates(points: Tensor, weights: Tensor | None = None) -> tuple[
     The points come transposed in memory: on a CPU, one coordinate of all points is a longer run than all of one point.
     """
     rows = points.mT.contiguous()
-    origin = weighted_mean(rows.mT, weights)
+    origin = checks.weighted_mean(rows.mT, weights)
     centred = rows - origin[..., None]
     least = torch.finfo(points.dtype).tiny  # so that the distance of a point at the centroid has a derivative
     distance = (centred.square().sum(-2) + least).sqrt()
-    radius = weighted_mean(distance[..., None], weights)[..., 0]
+    radius = checks.weighted_mean(distance[..., None], weights)[..., 0]
     # A mean is not exact: up to this distance from it, points coincide.
     rounding = 16 * torch.finfo(points.dtype).eps * torch.linalg.vector_norm(origin.detach(), dim=-1)
     scale = math.sqrt(2) / torch.where(radius > rounding + 2 * math.sqrt(least), radius, math.sqrt(2))
     shift_x, shift_y = (origin * -scale[..., None]).unbind(-1)
     zero, one = torch.zeros_like(scale), torch.ones_like(scale)
     entries = torch.stack([scale, zero, shift_x, zero, scale, shift_y, zero, zero, one], -1)
-    homogeneous = pad(centred * scale[..., None, None], (0, 0, 0, 1), value=1.0)
-    return homogeneous.mT, torch.unflatten(entries, -1, (3, 3))
+    return pad(centred * scale[..., None, None], (0, 0, 0, 1), value=1.0).mT, torch.unflatten(entries, -1, (3, 3))

@@ -47,8 +47,7 @@ def _roots(a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
     u = -torch.copysign((q.abs() + root) ** (1 / 3), q)
     single = u - p / torch.where(u == 0, torch.inf, u)
     three = 2 * (-p).clamp(min=0).sqrt()[:, None] * torch.cos((torch.atan2(root, -q) / 3)[:, None] + _TURNS.to(p))
-    y = torch.where(alone[:, None], single[:, None], three)
-    x = y - middle[:, None]
+    x = torch.where(alone[:, None], single[:, None], three) - middle[:, None]
     a, b, c = a[:, None], b[:, None], c[:, None]
     slope = (3 * x + 2 * c) * x + b
     x = x - (((x + c) * x + b) * x + a) / torch.where(slope == 0, torch.inf, slope)

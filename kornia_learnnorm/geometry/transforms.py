@@ -102,8 +102,7 @@ def spd_transform(params: Tensor) -> Tensor:
     zero, one = torch.zeros_like(a), torch.ones_like(a)
     ox, oy = params[..., 3:].unbind(-1) if params.shape[-1] == 5 else (zero, zero)
     shift_x, shift_y = zero - xx * ox - xy * oy, zero - xy * ox - yy * oy
-    entries = torch.stack([xx, xy, shift_x, xy, yy, shift_y, zero, zero, one], -1)
-    return torch.unflatten(entries, -1, (3, 3))
+    return torch.unflatten(torch.stack([xx, xy, shift_x, xy, yy, shift_y, zero, zero, one], -1), -1, (3, 3))
 
 
 def inverse_sqrt(covariance: Tensor, floor: float = 1e-6) -> Tensor:

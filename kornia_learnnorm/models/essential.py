@@ -7,12 +7,13 @@ relative pose.
 """
 
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
 
 from kornia_learnnorm.geometry.constrained_fit import Fit, Loss
+from kornia_learnnorm.geometry.distances import Distance
 from kornia_learnnorm.geometry.dlt import design_matrix
 from kornia_learnnorm.geometry.five_point import essential_in_span
 from kornia_learnnorm.models.fundamental import Fundamental, Rank2
@@ -32,24 +33,21 @@ class Essential(Fundamental):
     sample_size = 5
     confidence = 0.999  # cameras leave noise less room
 
-    def __init__(self, C1: Tensor, C2: Tensor, distance: Literal["sampson", "symmetric"] = "sampson") -> None:
+    def __init__(self, C1: Tensor, C2: Tensor, distance: Distance = "sampson") -> None:
         super().__init__(distance=distance)
         # Of unit norm, so that the fundamental matrices have a norm of about one too.
-        self.C1, self.C2 = (C / torch.linalg.matrix_norm(C, keepdim=True) for C in (C1, C2))
+        self.C1, self.C2 = (torch.div(C, torch.linalg.matrix_norm(C, keepdim=True)) for C in (C1, C2))
 
     @classmethod
-    def of_cameras(
-        cls, K1: Tensor, K2: Tensor, T1: Tensor, T2: Tensor, distance: Literal["sampson", "symmetric"] = "sampson"
-    ) -> Self:
+    def of_cameras(cls, K1: Tensor, K2: Tensor, T1: Tensor, T2: Tensor, distance: Distance = "sampson") -> Self:
         """Return the model of pixels after transforms, of cameras and transforms that broadcast to (B, 3, 3)."""
         return cls(torch.linalg.inv_ex(T1 @ K1)[0], torch.linalg.inv_ex(T2 @ K2)[0], distance)
 
     def constrain(self, M: Tensor) -> Tensor:
         """Return the matrices of the nearest essential matrices."""
-        F_mat: Tensor = self.state(M).matrix()
-        return F_mat
+        return self.state(M).matrix()
 
-    def state(self, M: Tensor) -> Any:
+    def state(self, M: Tensor) -> "Calibrated":
         """Return the nearest essential matrices of unit norm."""
         inverse1, inverse2 = (torch.linalg.inv_ex(C)[0] for C in (self.C1, self.C2))
         return self.calibrated(inverse2.mT @ M @ inverse1)
@@ -70,8 +68,7 @@ class Essential(Fundamental):
         E_mat, real = essential_in_span(torch.unflatten(Q[..., 5:].mT, -1, (3, 3)))
         pivots = R.diagonal(dim1=-2, dim2=-1).abs()
         E_mat = E_mat[real & (pivots.amin(-1) > MIN_PIVOT * pivots.amax(-1))[:, None]]
-        F_mat: Tensor = self.C2.mT @ E_mat @ self.C1
-        return F_mat
+        return self.C2.mT @ E_mat @ self.C1
 
     def reweighted_fit(self, x1: Tensor, x2: Tensor, M: Tensor, losses: Sequence[Loss]) -> Fit | None:
         """Return None: there is no fit but Levenberg-Marquardt."""

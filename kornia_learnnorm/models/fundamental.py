@@ -15,7 +15,7 @@ from torch.nn.functional import normalize, pad
 
 from kornia_learnnorm.geometry.checks import check_choice
 from kornia_learnnorm.geometry.constrained_fit import Fit, Loss, constrained_fit
-from kornia_learnnorm.geometry.distances import DISTANCE_SCALES, line_norms
+from kornia_learnnorm.geometry.distances import DISTANCE_SCALES, Distance, line_norms
 from kornia_learnnorm.geometry.dlt import design_matrix, null_space, solve_rows
 from kornia_learnnorm.geometry.matrices import inverse, nearest_rank2
 from kornia_learnnorm.geometry.problem import LinearProblem
@@ -23,6 +23,7 @@ from kornia_learnnorm.geometry.rank2 import correct_rank2
 from kornia_learnnorm.geometry.seven_point import fundamental_in_span
 from kornia_learnnorm.models.two_view_model import TwoViewModel
 
+Rank2Method = Literal["projection", "optimal"]
 SIDEWAYS = (0.0, 0.0, 0.0, 0.0, 0.0, 0.5**0.5, 0.0, -(0.5**0.5), 0.0)  # F whose epipolar lines are the image's rows
 MIN_PIVOT = 1e-6  # of the largest one, of a sample of seven correspondences that is not degenerate
 MIN_RANK2_DETERMINANT = 1e-9  # of the 2x2 part of a matrix of rank 2 and unit norm
@@ -45,11 +46,7 @@ class Fundamental(TwoViewModel):
     sample_size = 7
     preferred: tuple[float, ...] = SIDEWAYS
 
-    def __init__(
-        self,
-        rank2: Literal["projection", "optimal"] = "projection",
-        distance: Literal["sampson", "symmetric"] = "sampson",
-    ) -> None:
+    def __init__(self, rank2: Rank2Method = "projection", distance: Distance = "sampson") -> None:
         check_choice("rank2", rank2, ("projection", "optimal"))
         check_choice("distance", distance, DISTANCE_SCALES)
         self.rank2, self.distance, self.scale = rank2, distance, DISTANCE_SCALES[distance]
@@ -163,8 +160,7 @@ class Fundamental(TwoViewModel):
 
     def is_degenerate(self, state: Any) -> Tensor:
         """Return which matrices have rank 1."""
-        degenerate: Tensor = torch.linalg.det(state.A).abs() < MIN_RANK2_DETERMINANT
-        return degenerate
+        return torch.lt(torch.linalg.det(state.A).abs(), MIN_RANK2_DETERMINANT)
 
 
 class Rank2(NamedTuple):

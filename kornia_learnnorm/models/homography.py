@@ -6,7 +6,7 @@ it.
 """
 
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -14,8 +14,9 @@ from torch.nn.functional import normalize, pad
 
 from kornia_learnnorm.geometry.checks import check_choice, safe_divisor
 from kornia_learnnorm.geometry.constrained_fit import Fit, Loss
+from kornia_learnnorm.geometry.distances import Distance
+from kornia_learnnorm.geometry.dlt import normal_equations
 from kornia_learnnorm.geometry.matrices import cofactors, determinant, inverse
-from kornia_learnnorm.geometry.row_moments import normal_equations
 from kornia_learnnorm.models.two_view_model import TwoViewModel
 
 IDENTITY = (3**-0.5, 0.0, 0.0, 0.0, 3**-0.5, 0.0, 0.0, 0.0, 3**-0.5)
@@ -46,7 +47,7 @@ class Homography(TwoViewModel):
     preferred: tuple[float, ...] = IDENTITY
     confidence, max_batch, pool_size, prescored = 0.9999, 4096, 4, 256  # samples of four are cheap
 
-    def __init__(self, distance: Literal["sampson", "symmetric"] = "sampson") -> None:
+    def __init__(self, distance: Distance = "sampson") -> None:
         check_choice("distance", distance, ("sampson", "symmetric"))
         self.distance, self.components = distance, 2 if distance == "sampson" else 4
 
@@ -302,9 +303,8 @@ def _sampson(M: Tensor, x1: Tensor, x2: Tensor, weights: Tensor | None) -> tuple
     pull = k2 * e[:, 0] / a + q * by_c
     zero = torch.zeros_like(a)
     e1, e2 = torch.stack([k1, -k2 * q], 1), torch.stack([zero, k2], 1)
-    da, db, dc = (
-        torch.stack(pair, 1) for pair in ((first / (-2 * a), pull * q), (zero, -pull - q * by_c), (zero, by_c))
-    )
+    by_abc = (first / (-2 * a), pull * q), (zero, -pull - q * by_c), (zero, by_c)
+    da, db, dc = (torch.stack(pair, 1) for pair in by_abc)
     x = x1[:, None]
     row1 = e1[:, :, None] * x + pad(2 * da[:, :, None] * G[:, :1] + db[:, :, None] * G[:, 1:], (0, 0, 0, 1))
     row2 = e2[:, :, None] * x + pad(db[:, :, None] * G[:, :1] + 2 * dc[:, :, None] * G[:, 1:], (0, 0, 0, 1))

@@ -92,8 +92,7 @@ class ReweightedWhitening(ProblemNormalizer):
         indices = torch.tensor(MINORS, device=w.device), torch.tensor(ENTRIES, device=w.device)
         # View 1's line of the rank-2 correction in the coordinates whitened with w.
         T = _whitening(points, w)
-        F_hat = transform_fundamental(F0, *cofactors(T).mT)
-        v = smallest_right_singular_vector(F_hat)[0]
+        v = smallest_right_singular_vector(transform_fundamental(F0, *cofactors(T).mT))[0]
         b = normalize((T[0].mT @ v[..., None]).squeeze(-1), dim=-1)
         a = _best_line(products[..., 1, :], w[:, 1], (inverse.mT @ b[..., None])[..., 0].mT, *indices)
         lines = torch.stack([b.mT, a], 1)

@@ -23,14 +23,13 @@ def solve_minimal_samples(
     the DLT of the model ``linear``.
     """
     model, shift = scorer.model, MIN_SAMPLE_SHIFT * scorer.threshold
-    x1, x2 = scorer.samples(rows)
+    x1, x2 = (x[:, rows].movedim(0, -1) for x in (scorer.x1, scorer.x2))
     if normalizer is None or rows.shape[1] < model.min_points:
         M = model.solve_samples(x1, x2, shift)
         if len(M) or model is not linear:
             return M
     else:
-        R = torch.linalg.qr(model.rows(x1, x2).mT, mode="r")[1]
-        determined = are_independent(R, x1, x2, shift)
+        determined = are_independent(torch.linalg.qr(model.rows(x1, x2).mT, mode="r")[1], x1, x2, shift)
         if bool(determined.any()):
             return _solve(scorer, rows[determined], linear, normalizer)
     rows = torch.unique(rows)[None]
@@ -41,8 +40,7 @@ def solve_minimal_samples(
 
 def _solve(scorer: PairScorer, rows: Tensor, linear: TwoViewModel, normalizer: Normalizer | None) -> Tensor:
     points1, points2 = (points[rows] for points in scorer.pixels)
-    problem = LinearProblem.from_points(points1, points2, None, linear)
-    return scorer.from_pixels(solve_linear(problem, normalizer))
+    return scorer.from_pixels(solve_linear(LinearProblem.from_points(points1, points2, None, linear), normalizer))
 
 
 def are_independent(R: Tensor, x1: Tensor, x2: Tensor, shift: float) -> Tensor:
@@ -52,8 +50,7 @@ def are_independent(R: Tensor, x1: Tensor, x2: Tensor, shift: float) -> Tensor:
     it than the least that a shift of the point, in pixels, moves it.
     """
     distance = R.diagonal(dim1=-2, dim2=-1).abs().amin(-1)
-    independent: Tensor = distance > shift * torch.minimum(x1[..., 2], x2[..., 2]).amin(-1)
-    return independent
+    return torch.gt(distance, shift * torch.minimum(x1[..., 2], x2[..., 2]).amin(-1))
 
 
 def spread_across(points: Tensor) -> float:

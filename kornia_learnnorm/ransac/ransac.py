@@ -2,7 +2,7 @@ r"""RANSAC for fundamental matrices, essential matrices and homographies."""
 
 import math
 import time
-from contextlib import ExitStack
+from contextlib import nullcontext
 from typing import Literal, NamedTuple
 
 import torch
@@ -10,18 +10,18 @@ from torch import Tensor, nn
 
 from kornia_learnnorm.estimators.linear import solve_linear
 from kornia_learnnorm.geometry.checks import check_cameras, check_choice, solve_dtype, without_autocast
+from kornia_learnnorm.geometry.distances import Distance
 from kornia_learnnorm.geometry.distinct_points import distinct_points
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.essential import Essential
-from kornia_learnnorm.models.fundamental import Fundamental
+from kornia_learnnorm.models.fundamental import Fundamental, Rank2Method
 from kornia_learnnorm.models.homography import Homography
 from kornia_learnnorm.models.two_view_model import TwoViewModel
 from kornia_learnnorm.normalizers.closed_form import Hartley
 from kornia_learnnorm.normalizers.normalizer import Normalizer, check_normalizer
 from kornia_learnnorm.ransac.arguments import check_matches, check_numbers
-from kornia_learnnorm.ransac.final_fit import fit_final
-from kornia_learnnorm.ransac.local_optimization import optimize_locally
+from kornia_learnnorm.ransac.fits import fit_final, optimize_locally
 from kornia_learnnorm.ransac.minimal_solver import solve_minimal_samples
 from kornia_learnnorm.ransac.samplers import Sampler, UniformSampler, WeightedSampler
 from kornia_learnnorm.ransac.scoring import MAX_MEDIAN_DISTANCES, Hypotheses, PairScorer, finite_and_bounded
@@ -120,8 +120,8 @@ class RANSAC(nn.Module):
         max_samples: int = 50_000,
         max_seconds: float | None = None,
         confidence: float | None = None,
-        distance: Literal["sampson", "symmetric"] = "sampson",
-        rank2: Literal["projection", "optimal"] | None = None,
+        distance: Distance = "sampson",
+        rank2: Rank2Method | None = None,
         refine: bool = True,
         seed: int | None = None,
         model: Literal["fundamental", "homography"] | TwoViewModel = "fundamental",
@@ -141,7 +141,7 @@ class RANSAC(nn.Module):
             model = Homography(distance) if model == "homography" else Fundamental(rank2, distance)
         self.model = model
         self.normalizer = Hartley() if normalizer is None and rank2 == "projection" else normalizer
-        self.rank2: Literal["projection", "optimal"] = rank2
+        self.rank2: Rank2Method = rank2
         self.inl_th, self.max_samples, self.max_seconds, self.confidence = inl_th, max_samples, max_seconds, confidence
         self.distance, self.refine = distance, refine
         self.seed = None if seed is None else int(seed)
@@ -203,38 +203,31 @@ class RANSAC(nn.Module):
         """
         check_cameras(K1, K2)
         if K1 is not None and not isinstance(self.model, Fundamental):
-            raise ValueError(
-                f"K1 and K2 make a fundamental matrix an essential one, got a {self.model.name}: leave them out"
-            )
+            text = f"K1 and K2 make a fundamental matrix an essential one, got a {self.model.name}"
+            raise ValueError(f"{text}: leave them out")
         cameras = None if K1 is None or K2 is None else (K1, K2)
         least = self.model.min_points if cameras is None else Essential.sample_size
         check_matches(points1, points2, weights, least)
-        with ExitStack() as stack:
-            if points1.device.type == "cpu":
-                stack.enter_context(one_thread())
-            stack.enter_context(without_autocast(points1))
-            # Inference mode is faster, but what a normaliser keeps of it would be of no use in training.
-            stack.enter_context(torch.inference_mode() if self.normalizer is None else torch.no_grad())
-            result = self._estimate(points1, points2, weights, cameras, least)
+        threads = one_thread() if points1.device.type == "cpu" else nullcontext()
+        # Inference mode is faster, but what a normaliser keeps of it would be of no use in training.
+        gradients = torch.inference_mode() if self.normalizer is None else torch.no_grad()
+        with threads, without_autocast(points1), gradients:
+            kept = torch.ones_like(points1[:, 0], dtype=torch.bool)
+            # Not "larger": one may be NaN.
+            if not torch.maximum(points1.abs().max(), points2.abs().max()) <= MAX_MEDIAN_DISTANCES * self.inl_th:
+                kept = finite_and_bounded(points1, points2, self.inl_th)
+            best = distinct_points(points1[kept], points2[kept], None if weights is None else weights[kept])
+            kept = kept.masked_scatter(kept, best)
+            weights = None if weights is None else weights[kept]
+            result = self._estimate(points1[kept], points2[kept], weights, cameras, least)
+            inliers = torch.zeros_like(kept).masked_scatter(kept, result.inliers)
         E_mat = None if result.E_mat is None else result.E_mat.clone()
-        return result._replace(F_mat=result.F_mat.clone(), inliers=result.inliers.clone(), E_mat=E_mat)
+        return result._replace(F_mat=result.F_mat.clone(), inliers=inliers.clone(), E_mat=E_mat)
 
     def _estimate(
         self, points1: Tensor, points2: Tensor, weights: Tensor | None, cameras: Cameras | None, least: int
     ) -> RansacResult:
-        """Estimate from the matches that count: finite, bounded, and one on each point."""
-        kept = torch.ones_like(points1[:, 0], dtype=torch.bool)
-        if not torch.maximum(points1.abs().max(), points2.abs().max()) <= MAX_MEDIAN_DISTANCES * self.inl_th:  # or NaN
-            kept = finite_and_bounded(points1, points2, self.inl_th)
-        best = distinct_points(points1[kept], points2[kept], None if weights is None else weights[kept])
-        kept = kept.masked_scatter(kept, best)
-        weights = None if weights is None else weights[kept]
-        result = self._estimate_kept(points1[kept], points2[kept], weights, cameras, least)
-        return result._replace(inliers=torch.zeros_like(kept).masked_scatter(kept, result.inliers))
-
-    def _estimate_kept(
-        self, points1: Tensor, points2: Tensor, weights: Tensor | None, cameras: Cameras | None, least: int
-    ) -> RansacResult:
+        """Estimate from matches that are finite, bounded, and one on each point."""
         if (len(points1) if weights is None else int((weights > 0).sum())) < least:
             return _failure(points1, 0, cameras)
         x1, x2 = (points.to(solve_dtype(points.device)) for points in (points1, points2))

@@ -21,8 +21,7 @@ def draw_distinct(totals: Tensor, size: int, generator: torch.Generator) -> Tens
     uniform = torch.rand(len(totals), size, generator=generator, device=totals.device, dtype=torch.float32)
     drawn = (uniform * (last + 1)).long().clamp_(max=last)
     for k, (column, end) in enumerate(zip(drawn.unbind(-1)[1:], last.unbind(-1)[1:], strict=True), 1):
-        met = (drawn[:, :k] == column[:, None]).any(-1)
-        torch.where(met, end, column, out=column)
+        torch.where((drawn[:, :k] == column[:, None]).any(-1), end, column, out=column)
     return drawn
 
 
@@ -83,10 +82,9 @@ class WeightedSampler:
         return torch.cat([drawn, *(self._draw_block(len(block), generator) for block in blocks)])
 
     def _draw_block(self, count: int, generator: torch.Generator) -> Tensor:
-        uniform = torch.rand(
-            count, len(self.weights), generator=generator, device=self.weights.device, dtype=torch.float32
-        )
-        return (uniform.clamp_(min=MIN_WEIGHT).log() / self.weights.float()).topk(self.size).indices
+        weights = self.weights.float()
+        uniform = torch.rand(count, len(weights), generator=generator, device=weights.device, dtype=weights.dtype)
+        return (uniform.clamp_(min=MIN_WEIGHT).log() / weights).topk(self.size).indices
 
     def hit_rate(self, inliers: Tensor, rows: Tensor | slice) -> float:
         """Return the probability of a sample without outliers, from the inliers (M,) among some rows."""

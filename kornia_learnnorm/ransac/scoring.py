@@ -15,6 +15,7 @@ from kornia_learnnorm.models.two_view_model import TwoViewModel
 MAX_MEDIAN_DISTANCES = 1e6  # largest distance from the median point, in median distances or thresholds
 BLOCK = 1 << 16  # distances computed at once, which stay in a core's cache
 SHORTLIST = 64  # hypotheses that are scored on all correspondences
+Rows = Tensor | slice  # of correspondences
 
 
 class Hypotheses(NamedTuple):
@@ -46,20 +47,14 @@ class PairScorer:
     """
 
     def __init__(
-        self,
-        points1: Tensor,
-        points2: Tensor,
-        threshold: float,
-        model: TwoViewModel,
-        rows: Tensor | slice = slice(None),
+        self, points1: Tensor, points2: Tensor, threshold: float, model: TwoViewModel, rows: Rows = slice(None)
     ) -> None:
         self.threshold, self.model, self.rows = threshold, model, rows
         both = torch.stack([points1.mT, points2.mT])
         origin = both.median(-1, keepdim=True).values
         centred = both - origin
         spread = centred.abs().flatten(1).median(-1).values.clamp_(min=threshold)[:, None, None]
-        x = torch.cat([centred, spread.expand_as(centred[:, :1])], 1)
-        self.x1, self.x2 = x
+        self.x1, self.x2 = torch.cat([centred, spread.expand_as(centred[:, :1])], 1).unbind(0)
         columns = torch.eye(3, 2, dtype=both.dtype, device=both.device).expand(2, 3, 2)
         self.T1, self.T2 = torch.cat([columns, torch.cat([-origin, spread], 1)], 2)
         self.terms = model.score_terms(self.x1[:, rows], self.x2[:, rows]).float()
@@ -75,10 +70,6 @@ class PairScorer:
     def pixels(self) -> tuple[Tensor, Tensor]:
         """Correspondences in pixels, (N, 2) for each view."""
         return (self.x1[:2] - self.T1[:2, 2:]).mT, (self.x2[:2] - self.T2[:2, 2:]).mT
-
-    def samples(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Return samples (K, M) of all correspondences in the scorer's coordinates, (K, M, 3)."""
-        return self.x1[:, rows].movedim(0, -1), self.x2[:, rows].movedim(0, -1)
 
     def from_pixels(self, F_mat: Tensor) -> Tensor:
         """Return matrices (K, 3, 3) of pixels in the scorer's coordinates."""
@@ -110,7 +101,7 @@ class PairScorer:
         """Return the distances (K, N) of all correspondences from matrices (K, 3, 3), pixels; NaN on an epipole."""
         return self.model.squares(self.model.residual(F_mat, self.x1[None], self.x2[None])).sqrt()
 
-    def cost(self, loss: Loss, rows: Tensor | slice = slice(None), weights: Tensor | None = None) -> RobustCost:
+    def cost(self, loss: Loss, rows: Rows = slice(None), weights: Tensor | None = None) -> RobustCost:
         """Return the sum of losses over some correspondences; weights (K or 1, M)."""
         x1, x2 = self.x1[None, :, rows], self.x2[None, :, rows]
         return RobustCost(self.model, x1, x2, torch.ones_like(x1[:, 0]) if weights is None else weights, loss)

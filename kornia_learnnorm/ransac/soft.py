@@ -132,10 +132,18 @@ def expected_loss(
         torch.Size([2, 50])
     """
     check_correspondences(points1, points2)
-    _check(points1, samples, log_probs)
+    if not isinstance(samples, Tensor) or samples.dtype != torch.int64:
+        got = samples.dtype if isinstance(samples, Tensor) else type(samples)
+        raise TypeError(f"samples must be an int64 tensor, got {got}")
+    KORNIA_CHECK_SHAPE(samples, ["B", "K", "8"])
+    batch, count = samples.shape[:2]
+    if batch != len(points1):
+        raise ValueError(f"samples of {len(points1)} sets of points are needed, got {batch}")
+    if log_probs is not None and (log_probs.shape != (batch, count) or count < 2):
+        wanted = f"{[batch, count]} with two samples or more"
+        raise ValueError(f"log_probs must have shape {wanted}, got {[*log_probs.shape]}")
     if not (threshold > 0 and slope > 0):
         raise ValueError(f"threshold and slope must be positive, got {threshold} and {slope}")
-    batch, count = samples.shape[:2]
     x1, x2 = (p.gather(1, samples.flatten(1)[..., None].expand(-1, -1, 2)) for p in (points1, points2))
     F = find_fundamental(x1.view(-1, 8, 2), x2.view(-1, 8, 2), normalizer=normalizer).view(batch, count, 3, 3)
     every1, every2 = (p[:, None].expand(-1, count, -1, -1) for p in (points1, points2))
@@ -151,15 +159,3 @@ def expected_loss(
         advantage = (expected[:, None] - without_each).detach()
         expected = expected + (advantage * (log_probs - log_probs.detach())).sum(-1)
     return SoftChoice(expected, F, scores.softmax(-1))
-
-
-def _check(points1: Tensor, samples: Tensor, log_probs: Tensor | None) -> None:
-    if not isinstance(samples, Tensor) or samples.dtype != torch.int64:
-        got = samples.dtype if isinstance(samples, Tensor) else type(samples)
-        raise TypeError(f"samples must be an int64 tensor, got {got}")
-    KORNIA_CHECK_SHAPE(samples, ["B", "K", "8"])
-    if len(samples) != len(points1):
-        raise ValueError(f"samples of {len(points1)} sets of points are needed, got {len(samples)}")
-    if log_probs is not None and (log_probs.shape != samples.shape[:2] or samples.shape[1] < 2):
-        expected = [*samples.shape[:2]]
-        raise ValueError(f"log_probs must have shape {expected} with two samples or more, got {[*log_probs.shape]}")

@@ -14,7 +14,7 @@ from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.metrics.poses import pose_error
 from kornia_learnnorm.models.essential import Essential
 from kornia_learnnorm.models.fundamental import Fundamental
-from kornia_learnnorm.ransac.final_fit import LOSS_SCALE
+from kornia_learnnorm.ransac.fits import LOSS_SCALE
 from kornia_learnnorm.two_view.inputs import Cameras
 from kornia_learnnorm.two_view.predicted_error import MEDIAN_SQUARE, MIN_NOISE
 
@@ -111,8 +111,7 @@ def _compare(tied: _Fit, free: _Fit, freedom: int, threshold: float, cameras: Ca
     added = max(0.0, tied.cost - free.cost) / freedom
     noise = max(medians[1] / MEDIAN_SQUARE, (MIN_NOISE * threshold) ** 2)
     misfit = min(added, max(0.0, medians[0] - medians[1]) / MEDIAN_SQUARE)
-    log_chance = -freedom / 2 * math.log10(1 + added / noise)
-    return Misfit(math.sqrt(misfit), log_chance, _pose_angle(tied, free, cameras))
+    return Misfit(math.sqrt(misfit), -freedom / 2 * math.log10(1 + added / noise), _pose_angle(tied, free, cameras))
 
 
 def _pose_angle(first: _Fit, second: _Fit, cameras: Cameras) -> float:

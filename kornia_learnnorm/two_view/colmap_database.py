@@ -271,8 +271,7 @@ def _write_pairs(
             if found is None:
                 continue
             config = int(getattr(pycolmap.TwoViewGeometryConfiguration, found.config))
-            inliers = matches[found.inliers]
-            geometry = pycolmap.TwoViewGeometry(config=config, inlier_matches=inliers, **found.matrices)
+            geometry = pycolmap.TwoViewGeometry(config=config, inlier_matches=matches[found.inliers], **found.matrices)
             if found.pose is not None:
                 R, t = found.pose
                 geometry.cam2_from_cam1 = pycolmap.Rigid3d(pycolmap.Rotation3d(R), t)

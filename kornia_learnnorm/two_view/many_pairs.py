@@ -64,15 +64,13 @@ class PairOptions:
 
     def arguments(self, image1: Path, image2: Path) -> dict[str, Any]:
         """Return the keyword arguments of ``estimate_pair`` for two image files."""
-        options = {
-            name: value for name, value in vars(self).items() if name not in ("weights", "K", "matches", "refine")
-        }
+        own = "weights", "K", "matches", "refine"  # are not arguments of ``estimate_pair``
+        options = {name: value for name, value in vars(self).items() if name not in own}
         texts = self.K * 2 if len(self.K) == 1 else self.K
         if len(texts) not in (0, 2):
             raise ValueError(f"K must be one camera for both images or two, got {len(texts)}")
         cameras = [read_camera(text, image) for text, image in zip(texts, (image1, image2), strict=False)]
-        modules = _modules(self.weights, self.refine)
-        return {**options, **modules, **dict(zip(("K1", "K2"), cameras, strict=False))}
+        return {**options, **_modules(self.weights, self.refine), **dict(zip(("K1", "K2"), cameras, strict=False))}
 
 
 @lru_cache(maxsize=1)

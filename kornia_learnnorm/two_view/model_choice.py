@@ -90,10 +90,8 @@ def compute_gric(
         uncalibrated image sequences, IJCV 1999.
     """
     x1, x2 = (convert_points_to_homogeneous(points).mT[None] for points in (points1, points2))
-    squares1, squares2 = (
-        model.squares(model.residual(M[None], x1, x2))[0]
-        for model, M in ((Fundamental(), F_mat), (Homography(), H_mat))
-    )
+    models = (Fundamental(), F_mat), (Homography(), H_mat)
+    squares1, squares2 = (model.squares(model.residual(M[None], x1, x2))[0] for model, M in models)
     inliers, moved = squares1 < threshold**2, squares2 < threshold**2
     kept = inliers | moved
     variances = squares1[inliers].median() / MEDIAN_SQUARE, squares2[moved].median() / MEDIAN_SQUARE_OF_TWO

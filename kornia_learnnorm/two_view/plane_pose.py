@@ -57,8 +57,7 @@ def plane_poses(H_mat: Tensor, K1: Tensor, K2: Tensor, points1: Tensor, points2:
         return []
     if largest - smallest < MIN_BASELINE * middle:
         return [PlanePose(sign * U @ Vh)]
-    eye = torch.eye(3).double().numpy()
-    _, *found = import_cv2().decomposeHomographyMat((sign * M / middle).numpy(), eye)
+    _, *found = import_cv2().decomposeHomographyMat((sign * M / middle).numpy(), torch.eye(3).double().numpy())
     poses = [[torch.from_numpy(value).squeeze() for value in pose] for pose in zip(*found, strict=True)]
     return [PlanePose(R, t / t.norm(), n) for R, t, n in poses if (n @ rays1 > 0).double().mean() >= MIN_IN_FRONT]
 

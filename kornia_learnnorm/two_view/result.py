@@ -77,10 +77,6 @@ class PairEstimate:
     other_pose: PlanePose | None = None  # second pose and normal that the plane allows; None if there is only one
     rows: Tensor | None = None  # index of each match among those given to estimate_matches, (N,); None of two images
 
-    def __str__(self) -> str:
-        """Return :meth:`summary`."""
-        return self.summary()
-
     @property
     def model(self) -> str:
         """Name of the model: ``fundamental`` or ``homography``."""
@@ -164,6 +160,8 @@ class PairEstimate:
         lines += [f"matches  {self.num_matches}{ratio}", f"inliers  {self.num_inliers} ({share:.1%}), {within}"]
         lines += [f"error    predicted error of {name}: {self.predicted_error:.2f} px ({meaning})"]
         return "\n".join([*lines, *(f"warning  {warning.code}: {warning.text}" for warning in self.warnings)])
+
+    __str__ = summary
 
 
 def package_versions() -> dict[str, str]:

@@ -17,7 +17,7 @@ from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.models.essential import Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.models.homography import Homography
-from kornia_learnnorm.ransac.final_fit import LOSS_SCALE, fit_final
+from kornia_learnnorm.ransac.fits import LOSS_SCALE, fit_final
 from kornia_learnnorm.ransac.ransac import RANSAC, RansacResult
 from kornia_learnnorm.ransac.scoring import PairScorer
 from kornia_learnnorm.two_view import parallax

@@ -20,7 +20,7 @@ def coordinates(points1, points2, size=7):
     """Homogeneous points (K, size, 3) of the first points of samples, in coordinates of all samples together."""
     points1, points2 = points1[:, :size], points2[:, :size]
     scorer = PairScorer(points1.flatten(0, 1), points2.flatten(0, 1), 1.0, Fundamental())
-    return scorer.samples(torch.arange(points1[..., 0].numel()).view(-1, size))
+    return [x.mT.view(-1, size, 3) for x in (scorer.x1, scorer.x2)]
 
 
 def reference(x1, x2) -> list[torch.Tensor]:

@@ -175,5 +175,4 @@ class ContextLayer(nn.Module):
         # In place: for large batches, new memory costs more than the sums. Not the last one: under autocast, `out` has
         # half the precision of `h`.
         hidden = self.point(z).add_(self.context(set_maximum(z, absent, 1))[:, None]).relu_()
-        update: Tensor = self.out(hidden)
-        return h + update
+        return torch.add(h, self.out(hidden))

@@ -1,28 +1,60 @@
-"""The final fit of RANSAC's best hypotheses to all correspondences."""
+"""The fits of RANSAC's hypotheses: local optimisation, and the final fit of the best ones to all correspondences."""
 
+import math
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from kornia_learnnorm.estimators.camera_evidence import contradict_cameras, keeps_fit
-from kornia_learnnorm.estimators.cheirality import in_front_of_best_pose
-from kornia_learnnorm.estimators.moments import Evidence
+from kornia_learnnorm.estimators.moments import Evidence, descend
 from kornia_learnnorm.estimators.optimize import minimize
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure, Loss, Truncated
 from kornia_learnnorm.models.essential import Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.ransac.scoring import Hypotheses, PairScorer
 
-LOSS_SCALE = 0.7  # scale of the loss, in thresholds
+LOCAL_SCALES = (3.0, 2.0, 1.5, 1.0, 1.0)  # thresholds of the steps: a noisy sample has few inliers
+MANIFOLD_SCALES = (3.0, 1.5, 1.0, 1.0)  # thresholds of the steps on the manifold
+# Number of these steps and their relaxation: bounded losses make them too short, but the first one comes from afar.
+MANIFOLD_STEPS = ((1, 1.0), (3, 1.3))
+TOLERANCE = 1e-3  # cosine of distances and derivatives at which a matrix has converged
+LOSS_SCALE = 0.7  # scale of the loss of the final fit, in thresholds
 STEPS = 3  # steps of least squares on that loss
 MIN_GAIN = 1e-3  # share of the cost that least squares may leave to gain; above, Levenberg-Marquardt goes on
 MAX_LM_STEPS = 10  # steps of Levenberg-Marquardt
 LM_RELAXATION = 1.4  # of those on the manifold
-TOLERANCE = 1e-3  # cosine of distances and derivatives at which a matrix has converged
 POSE_PIXELS = 2.0  # scale at which the pose of a matrix that left the cameras must still fit
 POOL_SIZE = 2  # best hypotheses, of which correspondences in front of both cameras choose one
 MIN_FRONT_GAIN = 1.1  # of another one over these: of the two poses of a plane, one has many behind a camera
+
+
+def optimize_locally(scorer: PairScorer, M: Tensor) -> Hypotheses:
+    """Return the best of the matrices (K, 3, 3) fitted to their inliers among the scored correspondences.
+
+    Reference:
+        O. Chum, J. Matas, J. Kittler, Locally optimized RANSAC, DAGM 2003.
+    """
+    losses = [Truncated(scale * scorer.threshold) for scale in LOCAL_SCALES]
+    fit = scorer.model.reweighted_fit(scorer.x1[:, scorer.rows], scorer.x2[:, scorer.rows], M, losses)
+    if fit is not None:
+        return scorer.best(fit.F_mat, scorer.model.pool_size)
+    state = scorer.model.state(M)
+    if isinstance(scorer.model, Essential):
+        every = math.ceil(scorer.terms.shape[-1] / scorer.model.prescored)
+        x1, x2 = (x[None, :, scorer.rows][..., ::every] for x in (scorer.x1, scorer.x2))
+        evidence, weights = Evidence.from_points(x1, x2), torch.ones_like(x1[:, :1]).expand(-1, len(M), -1)
+        scales = iter(MANIFOLD_SCALES)
+
+        def square_scale(squares: Tensor) -> Tensor:
+            return squares.new_full((1, 1, 1), (next(scales) * scorer.threshold) ** 2)
+
+        for steps, relaxation in MANIFOLD_STEPS:
+            state = descend(evidence, state, weights, square_scale, steps, relaxation)
+        return scorer.best(state.matrix(), scorer.model.pool_size)
+    for scale in MANIFOLD_SCALES:
+        state = minimize(scorer.cost(Truncated(scale * scorer.threshold), scorer.rows), state, 1, TOLERANCE)[1].state
+    return scorer.best(state.matrix(), scorer.model.pool_size)
 
 
 def fit_final(scorer: PairScorer, pool: Hypotheses) -> Any:
@@ -56,7 +88,7 @@ def _fit_on_manifold(scorer: PairScorer, M: Tensor, loss: Loss) -> Any:
         gains = (1 - (scorer.distances(pool) / scorer.threshold).square()).clamp(min=0).nan_to_num(0.0)
         weights = torch.ones_like(gains)
         if evidence is not None:
-            weights = in_front_of_best_pose(evidence, state, gains[None], len(pool))[0].to(gains)
+            weights = evidence.in_front(state, gains[None], len(pool))[0].to(gains)
         votes = (gains * weights).sum(-1)
         best, other = int(votes[:POOL_SIZE].argmax()), int(votes.argmax())
         best = other if float(votes[other]) > MIN_FRONT_GAIN * float(votes[best]) else best
@@ -72,5 +104,4 @@ def _fit_on_manifold(scorer: PairScorer, M: Tensor, loss: Loss) -> Any:
         return state
     free = minimize(last, Fundamental().state(state.matrix()), MAX_LM_STEPS, TOLERANCE)[1].state
     pose: Any = model.state(free.matrix())
-    wide = square_scale.clamp(min=POSE_PIXELS**2)
-    return free if bool(keeps_fit(evidence, state, pose, weights, wide)) else state
+    return free if bool(keeps_fit(evidence, state, pose, weights, square_scale.clamp(min=POSE_PIXELS**2))) else state
