@@ -35,7 +35,7 @@ class Checkpoints(ModelCheckpoint):
     """
 
     def __init__(self, every_n_train_steps: int = 100) -> None:
-        super().__init__(save_last=True, every_n_train_steps=every_n_train_steps, enable_version_counter=False)
+        super().__init__(save_last=True, save_top_k=0, every_n_train_steps=every_n_train_steps)
         self._previous_handler: Any = None
         self._interrupted = self._started = False
 

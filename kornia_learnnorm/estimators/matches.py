@@ -124,7 +124,7 @@ def _keypoints(name: str, keypoints: Keypoints) -> Tensor:
 
 def _from_mapping(found: Mapping[str, Any]) -> tuple[Tensor | Sequence[Tensor], Scores]:
     """Return the matches and scores of LightGlue's output, with a batch."""
-    pairs = "matches0" not in found
+    pairs = "matches" in found or "matches0" not in found  # pairs may have been filtered
     matches = _entry(found, "matches" if pairs else "matches0")
     scores = found.get("scores" if pairs else "matching_scores0")
     if isinstance(matches, Tensor) and matches.ndim == 1 + pairs:  # of one pair

@@ -23,6 +23,10 @@ class NoReliableMatrixError(ValueError):
         super().__init__(text)
         self.code = code
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return what pickle needs, as in a pool of processes: the arguments are not those of ValueError."""
+        return type(self), (self.code, str(self))
+
 
 class ModelChoice(NamedTuple):
     """The model of the result, and the numbers that decided; None where a matrix was not sought or not found."""

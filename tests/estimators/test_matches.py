@@ -60,6 +60,8 @@ def test_every_form_of_lightglues_output_is_the_same():
     padded = pad_sequence(found["matches"], batch_first=True, padding_value=-1), pad_sequence(found["scores"], True)
     for form in ((*sides, found), (*sides, by_keypoint), (*keypoints, found), (*keypoints, *padded)):
         assert_close(correspondences_from_matches(*form), expected)
+    filtered = {name: [value[:5] for value in found[name]] for name in ("matches", "scores")}
+    assert (correspondences_from_matches(*sides, found | filtered).mask.sum(1) == 5).all()
     for k in range(2):  # as the reference's rbd removes the batch
         views = [{"keypoints": points[k]} for points in keypoints]
         one = {name: found[name][k] for name in ("matches", "scores", "matches0", "matching_scores0")}

@@ -1,6 +1,7 @@
 """The estimate of matches, its errors and its invariances."""
 
 import json
+import pickle
 
 import numpy as np
 import pytest
@@ -178,7 +179,7 @@ def test_no_matrix():
     ]:
         with pytest.raises(kln.NoReliableMatrixError) as caught:
             kln.estimate_matches(points1, points1 + shift)
-        assert caught.value.code == code
+        assert pickle.loads(pickle.dumps(caught.value)).code == code  # a process may have raised it
 
 
 @pytest.mark.parametrize("seed", [4, 8, 13])
