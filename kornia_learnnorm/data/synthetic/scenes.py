@@ -6,7 +6,7 @@ on the generator's device and depends only on the arguments and the generator's 
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -194,20 +194,11 @@ def _project(X: Tensor, K: Tensor, R: Tensor, t: Tensor, size: Tensor) -> tuple[
     return x2, inside & (MAX_SCALE_CHANGE * z > X[:, 2:])
 
 
-SCENES: dict[str, Callable[..., TwoViewScene]] = {
-    "forward driving": forward_driving,
-    "hand-held": handheld,
-    "orbit": orbit,
-}
+SCENES = {"forward driving": forward_driving, "hand-held": handheld, "orbit": orbit}
 
 
 def synthetic_store(
-    pairs: int,
-    points: int,
-    seed: int = 0,
-    noise: float = 0.5,
-    outliers: float = 0.2,
-    scenes: Sequence[str] = tuple(SCENES),
+    pairs: int, points: int, seed: int = 0, noise: float = 0.5, outliers: float = 0.2, scenes: Collection[str] = SCENES
 ) -> CorrespondenceStore:
     """Return a store of synthetic scenes, ``pairs`` of each kind; the ratio test of 0.8 keeps half of the outliers."""
     if pairs < 1 or points < 8:
