@@ -13,15 +13,12 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler, OneCycleLR
 from torchmetrics import CatMetric, MeanMetric, Metric, SumMetric
 
+from kornia_learnnorm import EightPoint, Hartley, LearnedNormalizer, LearnedRelativePose, Whitening
 from kornia_learnnorm.data.match_sets import MatchSets
 from kornia_learnnorm.estimators.learned_layer import LearnedLayer
-from kornia_learnnorm.estimators.learned_relative_pose import LearnedRelativePose
-from kornia_learnnorm.estimators.linear import EightPoint
 from kornia_learnnorm.geometry.checks import solve_dtype
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.metrics.statistics import comparable
-from kornia_learnnorm.normalizers.closed_form import Hartley, Whitening
-from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
 from kornia_learnnorm.training_losses import BoundedEpipolarLoss, InlierLoss, LogEpipolarLoss, LogEssentialLoss
 
 __all__ = ["EstimatorTask", "Median", "SetLoss", "adamw", "cameras_of"]

@@ -12,17 +12,13 @@ from kornia.geometry.epipolar import fundamental_from_essential
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
-from kornia_learnnorm.estimators.learned_relative_pose import LearnedRelativePose
-from kornia_learnnorm.estimators.refinement import refine_fundamental
-from kornia_learnnorm.estimators.robust_losses import GemanMcClure
+from kornia_learnnorm import RANSAC, GemanMcClure, LearnedEightPoint, LearnedRelativePose, refine_fundamental
 from kornia_learnnorm.evaluation.methods import REFINED, base_name, find_method, identify_method, short_name_of
 from kornia_learnnorm.evaluation.robust.peers import CALIBRATED, PEERS, Peer, find_peer, peer_version
 from kornia_learnnorm.evaluation.tables import names_of
 from kornia_learnnorm.models.essential import Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.pretrained import weights_digest, weights_model
-from kornia_learnnorm.ransac.ransac import RANSAC
 
 TRUTH = "ground-truth"
 MAX_SAMPLES = 20_000  # minimal samples of RANSAC:METHOD, whose normaliser can be a network

@@ -37,6 +37,8 @@ MAX_NAME = 80  # letters of a name in that of a file
 
 About = dict[str, Any]
 Arrays = dict[str, NDArray[Any]]
+Names = Sequence[str]
+Paths = Mapping[str, str]  # of stores, by their names in tables
 Stores = Mapping[str, CorrespondenceStore]  # by their names in tables
 Job = tuple[str, Path, Callable[[], Arrays]]  # a method, the file that it makes, and how
 
