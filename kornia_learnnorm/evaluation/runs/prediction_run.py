@@ -14,7 +14,7 @@ from torch import Tensor
 
 from kornia_learnnorm import relative_pose, symmetric_epipolar_distance
 from kornia_learnnorm.data.match_sets import MatchSets, draw_samples, plain_residual
-from kornia_learnnorm.data.store import CorrespondenceStore, read_store
+from kornia_learnnorm.data.store import CorrespondenceStore, MaxRatio, read_store
 from kornia_learnnorm.evaluation.diagnostics import diagnose_in_coordinates
 from kornia_learnnorm.evaluation.methods import Method, find_method, identify_method, short_name_of
 from kornia_learnnorm.evaluation.runs import results_store
@@ -57,10 +57,10 @@ class SampleOptions:
         if self.max_samples is not None and self.max_samples < 1:
             raise ValueError(f"max_samples must be 1 or more, or None for all, got {self.max_samples}")
 
-    def draw(self, store: CorrespondenceStore, max_ratio: float | None) -> MatchSets:
+    def draw(self, store: CorrespondenceStore, max_ratio: MaxRatio) -> MatchSets:
         """Return samples before the filter on the residual; held-out points of pairs without any are NaN."""
         generator = torch.Generator().manual_seed(self.seed)
-        samples = draw_samples(store, generator, self.size, max_ratio, NUM_HELDOUT, require_heldout=False)
+        samples = draw_samples(store, generator, self.size, max_ratio, NUM_HELDOUT)
         if self.max_samples is None or len(samples.pair) <= self.max_samples:
             return samples
         order = torch.randperm(len(samples.pair), generator=generator)
@@ -69,7 +69,7 @@ class SampleOptions:
 
 @torch.no_grad()
 def predict(
-    method: Method, samples: MatchSets, store: CorrespondenceStore, max_ratio: float | None, agreement: bool = True
+    method: Method, samples: MatchSets, store: CorrespondenceStore, max_ratio: MaxRatio, agreement: bool = True
 ) -> Arrays:
     """Return a method's matrices of the samples of a store, ``ERRORS`` and, where wanted, ``AGREEMENT``, (S, ...)."""
     truth = ground_truth_inliers(store)
@@ -99,7 +99,7 @@ def _predict_batch(method: Method, samples: MatchSets, store: CorrespondenceStor
     }
 
 
-def consensus(F_mat: Tensor, pair: Tensor, store: CorrespondenceStore, max_ratio: float | None) -> dict[str, Tensor]:
+def consensus(F_mat: Tensor, pair: Tensor, store: CorrespondenceStore, max_ratio: MaxRatio) -> dict[str, Tensor]:
     """Return ``inliers``, a share, and ``f1``, (S, thresholds), of matrices (S, 3, 3) on all matches of their pairs."""
     inliers = F_mat.new_full((len(F_mat), len(THRESHOLDS)), torch.nan)
     f1 = inliers.clone()
@@ -113,7 +113,7 @@ def consensus(F_mat: Tensor, pair: Tensor, store: CorrespondenceStore, max_ratio
     return {"inliers": inliers, "f1": f1}
 
 
-def pair_matches(store: CorrespondenceStore, pair: int, max_ratio: float | None) -> tuple[Tensor, Tensor]:
+def pair_matches(store: CorrespondenceStore, pair: int, max_ratio: MaxRatio) -> tuple[Tensor, Tensor]:
     """Return the matches of an image pair in both views below Lowe's ratio, pixels, (M, 2) float64 each."""
     points1, points2, _ = store.matches(pair, max_ratio)
     return torch.from_numpy(points1).double(), torch.from_numpy(points2).double()
@@ -201,13 +201,11 @@ def _jobs(
             yield label, path(label), partial(predict, method, samples, store, max_ratio, complete)
 
 
-def _samples(
-    path: Path, place: str, options: SampleOptions, store: CorrespondenceStore, max_ratio: float | None
-) -> MatchSets:
+def _samples(path: Path, place: str, options: SampleOptions, store: CorrespondenceStore, ratio: MaxRatio) -> MatchSets:
     """Return the samples within the limit on the residual; write all that were drawn."""
     limit = options.max_residual
     with explained(place, ValueError):
-        drawn = options.draw(store, max_ratio)
+        drawn = options.draw(store, ratio)
     if not path.is_file():
         residual = plain_residual(drawn.points1, drawn.points2).numpy()
         if not (residual < limit).any():
