@@ -158,7 +158,6 @@ class _Exported(nn.Module):
 
 
 def _to_onnx(network: nn.Module, example: dict[str, Tensor], outputs: list[str]) -> Any:
-    """Return the ONNX program of a network with dynamic batch and number of points."""
     sizes = {0: Dim("B", min=1), 1: Dim("N", min=2)}
     shapes = {name: {0: sizes[0]} if name == "null_matrix" else sizes for name in example}
     logger = logging.getLogger("torch.onnx")

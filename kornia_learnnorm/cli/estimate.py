@@ -183,7 +183,6 @@ def _check_options(args: argparse.Namespace) -> None:
 
 
 def _check_many(args: argparse.Namespace) -> None:
-    """Raise ValueError for options that do not go with a list of pairs."""
     given = {"image files": args.images, "--json": args.json, "--mask": args.mask}
     if wrong := [name for name, value in given.items() if value]:
         raise ValueError(f"--pairs {args.pairs}: cannot be combined with {' and '.join(wrong)}")

@@ -76,7 +76,6 @@ def read_colour(path: str | Path, max_size: int | None = None) -> NDArray[np.uin
 
 
 def _read(path: Path, mode: str, max_size: int | None) -> NDArray[np.uint8]:
-    """Decode an image file; errors name the file and what is wrong with it."""
     if not path.exists():
         raise FileNotFoundError(f"image {path} does not exist")
     reduced_size((1, 1), max_size)  # checks the limit before a file is read

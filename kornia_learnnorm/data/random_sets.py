@@ -139,8 +139,6 @@ class StoreSets:
 
 
 class _Pair:
-    """The matches of one pair of a store."""
-
     def __init__(self, store: CorrespondenceStore, index: int, labels: bool) -> None:
         rows = store.rows(index)
         points1, points2 = (torch.from_numpy(points[rows]).double() for points in (store.points1, store.points2))

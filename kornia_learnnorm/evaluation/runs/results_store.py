@@ -135,7 +135,6 @@ def _begin(
 
 
 def _read(folder: Path) -> dict[str, Any]:
-    """Return the sections; none where there is no run."""
     path = folder / "run.json"
     if not path.is_file():
         return {}
