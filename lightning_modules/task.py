@@ -75,9 +75,8 @@ class SetLoss(nn.Module):
         if self.pose_weight and sets.K1 is not None and sets.K2 is not None and sets.E_mat is not None:
             calibrated = sets.E_mat.isfinite().flatten(1).all(1)
             eye = torch.eye(3).to(F_mat)  # where unknown: NaN has no derivative that can be dropped
-            K1, K2, true = (
-                torch.where(calibrated[:, None, None], value.to(F_mat), eye) for value in (sets.K1, sets.K2, sets.E_mat)
-            )
+            given = calibrated[:, None, None]
+            K1, K2, true = (torch.where(given, value.to(F_mat), eye) for value in (sets.K1, sets.K2, sets.E_mat))
             share = self.pose_weight * calibrated
             known = (1 - share) * known + share * self.pose(K2.mT @ F_mat @ K1, true)
         if logits is not None and sets.inliers is not None:
@@ -187,9 +186,8 @@ class EstimatorTask(pl.LightningModule):
         self.log("train/skipped", float(skipped))
         self._sets, self._skipped = 0, self._skipped + 1 if skipped else 0
         if self._skipped == MAX_SKIPPED:
-            raise ValueError(
-                f"{MAX_SKIPPED} steps in a row were skipped: no samples, or no finite gradient of the loss"
-            )
+            why = "no samples, or no finite gradient of the loss"
+            raise ValueError(f"{MAX_SKIPPED} steps in a row were skipped: {why}")
 
     def _finite(self, batch: MatchSets) -> tuple[MatchSets, int]:
         """Return the sets that are finite, with the cameras that a pose needs, and how many others there are."""

@@ -58,7 +58,7 @@ def random_scenes(batch_size: int, num_points: int, generator: Generator) -> Two
 
 def random_views(batch_size: int, num_points: int, generator: Generator) -> TwoViewScene:
     """Draw the scenes of :func:`random_scenes` without noise and outliers; the arguments and errors are the same."""
-    _check_arguments(batch_size, num_points, generator)
+    _check_arguments(batch_size, num_points, generator, 0.0, 0.0)
     size, K = draws.random_cameras(batch_size, generator)
     points1 = draws.spread_points(size, 2 * num_points + 16, generator, clustered=0.5)
     height = draws.log_uniform((batch_size, 1), 1.2, 4.0, generator)
@@ -134,9 +134,7 @@ def orbit(
     return _corrupt_evenly(scene, noise, outliers, generator)
 
 
-def _check_arguments(
-    batch_size: int, num_points: int, generator: Generator, noise: float = 0.0, outliers: float = 0.0
-) -> None:
+def _check_arguments(batch_size: int, num_points: int, generator: Generator, noise: float, outliers: float) -> None:
     for name, value in (("batch_size", batch_size), ("num_points", num_points)):
         if value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")

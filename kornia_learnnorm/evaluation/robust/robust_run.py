@@ -1,6 +1,6 @@
 """Results of robust estimators on stores, kept in a folder: what ``learnnorm robust`` makes."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial
 from itertools import product
@@ -52,7 +52,7 @@ class RobustRun(NamedTuple):
 
 
 def record_robust(
-    folder: Path, stores: Paths, estimators: Names, options: Mapping[str, int], redo: Names, command: str
+    folder: Path, stores: Paths, estimators: Names, options: dict[str, int], redo: Names, command: str
 ) -> list[str]:
     """Compute the missing results of a run; return the estimators that were left out: their packages are not installed.
 
@@ -84,9 +84,7 @@ def record_robust(
     return [name for name in identities if name not in installed]
 
 
-def _jobs(
-    folder: Path, stores: Stores, estimators: Mapping[str, Estimator], options: Mapping[str, int]
-) -> Iterator[Job]:
+def _jobs(folder: Path, stores: Stores, estimators: dict[str, Estimator], options: dict[str, int]) -> Iterator[Job]:
     for store, protocol, name, threshold in product(stores, PROTOCOLS, estimators, THRESHOLDS):
         pairs = even_pairs(len(stores[store]), options["pairs"])
         seeds = min(options["seeds"], options["slow_seeds"]) if robust_estimators.is_slow(name) else options["seeds"]
