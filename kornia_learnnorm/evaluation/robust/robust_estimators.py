@@ -16,7 +16,6 @@ from kornia_learnnorm import RANSAC, GemanMcClure, LearnedEightPoint, LearnedRel
 from kornia_learnnorm.evaluation.methods import REFINED, base_name, find_method, identify_method, short_name_of
 from kornia_learnnorm.evaluation.robust.peers import CALIBRATED, PEERS, Peer, find_peer, peer_version
 from kornia_learnnorm.evaluation.tables import names_of
-from kornia_learnnorm.models.essential import Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.pretrained import weights_digest, weights_model
 
@@ -94,7 +93,7 @@ def find_estimator(name: str) -> Estimator:
         return partial(_ransac, {}, name != DEFAULTS)
     if kind == LEARNED and method:
         weights = _weights_of(method)
-        calibrated = weights_model(weights) == Essential.name
+        calibrated = weights_model(weights) == LearnedRelativePose.model_name
         if calibrated and method.endswith(REFINED):
             raise ValueError(f"relative poses are refined by themselves: expected {weights!r}, got {method!r}")
         layer = (LearnedRelativePose if calibrated else LearnedEightPoint).from_pretrained(weights)

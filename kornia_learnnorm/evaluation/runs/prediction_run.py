@@ -186,7 +186,7 @@ def record_run(
         "trained_on": {name: list(method.trained_on) for name, method in found.items()},
     }
     jobs, total = _jobs(folder, read, found, options, complete), len(read) * len(PROTOCOLS) * len(found)
-    if failed := results_store.record(folder, "evaluate", read, about, jobs, total, command=command):
+    if failed := results_store.record(folder, "evaluate", read, about, jobs, total, (), command):
         raise ValueError(failed + (f". All others are in {folder}" if complete else ""))
 
 

@@ -44,14 +44,7 @@ Job = tuple[str, Path, Callable[[], Arrays]]  # a method, the file that it makes
 
 
 def record(
-    folder: Path,
-    section: str,
-    stores: Stores,
-    about: About,
-    jobs: Iterable[Job],
-    total: int,
-    redo: Names = (),
-    command: str = "",
+    folder: Path, section: str, stores: Stores, about: About, jobs: Iterable[Job], total: int, redo: Names, command: str
 ) -> str:
     """Do the jobs, at most ``total``, whose files are missing, or refuse a folder of other options.
 
