@@ -16,12 +16,11 @@ import gradio as gr
 import numpy as np
 import torch
 from kornia.geometry.linalg import transform_points
-from numpy.typing import NDArray
 from starlette.datastructures import Headers
 from starlette.middleware import Middleware
 from starlette.responses import PlainTextResponse
 
-from kornia_learnnorm.data.images import read_colour
+from kornia_learnnorm.data.images import Pixels, read_colour
 from kornia_learnnorm.data.matching.features import DETECTORS
 from kornia_learnnorm.data.matching.matchers import MATCHERS
 from kornia_learnnorm.data.synthetic.render import render_pair, write_pair
@@ -54,8 +53,6 @@ OFF = ("share", "ssr_mode", "mcp_server", "pwa", "run_history", "enable_monitori
 CSS = "#estimate textarea {font: clamp(8.5px, 2.2vw, 14px) / 1.5 monospace}"
 PROGRESS = gr.Progress()
 log = logging.getLogger(__name__)
-
-Pixels = NDArray[np.uint8]  # RGB, (H, W, 3)
 
 
 class Result(NamedTuple):

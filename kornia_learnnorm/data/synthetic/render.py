@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from kornia_learnnorm.data.datasets.frames import fundamental_from_motion
-from kornia_learnnorm.data.images import Size, import_cv2
+from kornia_learnnorm.data.images import Pixels, Size, import_cv2
 from kornia_learnnorm.files import atomic_write, write_text
 
 __all__ = ["Plane", "RenderedPair", "check_size", "circles", "framed", "letters", "masonry", "noise", "polygons"]
@@ -33,8 +33,8 @@ Planes = Sequence["Plane"]  # from back to front
 class RenderedPair(NamedTuple):
     """Two rendered images and their geometry: X2 = R X1 + t for points in space, x2^T F x1 = 0."""
 
-    image1: NDArray[np.uint8]  # grey, (H, W)
-    image2: NDArray[np.uint8]
+    image1: Pixels  # grey, (H, W)
+    image2: Pixels
     K: Array  # intrinsics of both cameras, pixels, (3, 3); pixel centres are at whole numbers
     R: Array  # (3, 3)
     t: Array  # metres, (3,)
@@ -149,7 +149,7 @@ def rotation(yaw: float, pitch: float, roll: float) -> Array:
     return np.asarray(Rz @ Rx @ Ry)
 
 
-def render_view(rng: Random, cv2: Any, planes: Planes, K: Array, R: Array, t: Array, size: Size) -> NDArray[np.uint8]:
+def render_view(rng: Random, cv2: Any, planes: Planes, K: Array, R: Array, t: Array, size: Size) -> Pixels:
     """Render the planes from back to front on a finer grid, average it, and add noise of one grey level."""
     fine = (size[0] * SUPERSAMPLING, size[1] * SUPERSAMPLING)
     centre = (SUPERSAMPLING - 1) / 2
