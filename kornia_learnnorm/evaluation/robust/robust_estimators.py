@@ -55,6 +55,7 @@ class Estimate(NamedTuple):
     samples: float  # number of minimal samples solved; NaN if unknown
 
 
+Learned = LearnedEightPoint | LearnedRelativePose
 Found = tuple[Tensor | None, float]  # a matrix, None for a failure, and the number of minimal samples
 Estimator = Callable[[EvaluatedPair, int, float], Found]  # of a pair, a seed and a threshold in pixels
 
@@ -130,9 +131,7 @@ def _ransac(
     return found.F_mat if bool(found.F_mat.any()) else None, found.num_samples
 
 
-def _learned(
-    layer: LearnedEightPoint | LearnedRelativePose, method: str, pair: EvaluatedPair, seed: int, threshold: float
-) -> Found:
+def _learned(layer: Learned, method: str, pair: EvaluatedPair, seed: int, threshold: float) -> Found:
     points1, points2 = pair.points1[None], pair.points2[None]
     scores = pair.scores[None] if method.removesuffix(REFINED).endswith(SCORED) else None
     if isinstance(layer, LearnedRelativePose):
