@@ -8,38 +8,27 @@ Example:
     torch.Size([4, 3, 3])
 """
 
-from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
-from kornia_learnnorm.estimators.learned_homography import LearnedHomography
-from kornia_learnnorm.estimators.learned_relative_pose import LearnedRelativePose
-from kornia_learnnorm.estimators.linear import EightPoint, find_fundamental, find_homography
-from kornia_learnnorm.estimators.match_refiner import MatchRefiner
-from kornia_learnnorm.estimators.refinement import refine_essential, refine_fundamental
-from kornia_learnnorm.estimators.robust_losses import Cauchy, GemanMcClure, Huber, Truncated
-from kornia_learnnorm.geometry.distances import (
-    algebraic_distance,
-    sampson_distance,
-    symmetric_epipolar_distance,
-    transfer_distance,
-)
-from kornia_learnnorm.geometry.pose import relative_pose
-from kornia_learnnorm.geometry.rank2 import optimal_rank2
-from kornia_learnnorm.normalizers.closed_form import Hartley, Identity, Whitening
-from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
-from kornia_learnnorm.normalizers.networks.crossview import CrossViewNetwork
-from kornia_learnnorm.normalizers.networks.paper import PaperNetwork
-from kornia_learnnorm.normalizers.normalizer import PerView
-from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
-from kornia_learnnorm.ransac.ransac import RANSAC
-from kornia_learnnorm.training_losses import (
-    BoundedEpipolarLoss,
-    EpipolarLoss,
-    InlierLoss,
-    LogEpipolarLoss,
-    LogEssentialLoss,
-)
-from kornia_learnnorm.two_view.estimate_matches import estimate_matches
-from kornia_learnnorm.two_view.estimate_pair import estimate_pair
-from kornia_learnnorm.two_view.result import NoReliableMatrixError
+from .estimators.learned_eight_point import LearnedEightPoint
+from .estimators.learned_homography import LearnedHomography
+from .estimators.learned_relative_pose import LearnedRelativePose
+from .estimators.linear import EightPoint, find_fundamental, find_homography
+from .estimators.match_refiner import MatchRefiner
+from .estimators.refinement import refine_essential, refine_fundamental
+from .estimators.robust_losses import Cauchy, GemanMcClure, Huber, Truncated
+from .geometry.distances import algebraic_distance, sampson_distance, symmetric_epipolar_distance, transfer_distance
+from .geometry.pose import relative_pose
+from .geometry.rank2 import optimal_rank2
+from .normalizers.closed_form import Hartley, Identity, Whitening
+from .normalizers.learned_normalizer import LearnedNormalizer
+from .normalizers.networks.crossview import CrossViewNetwork
+from .normalizers.networks.paper import PaperNetwork
+from .normalizers.normalizer import PerView
+from .normalizers.reweighted import ReweightedWhitening
+from .ransac.ransac import RANSAC
+from .training_losses import BoundedEpipolarLoss, EpipolarLoss, InlierLoss, LogEpipolarLoss, LogEssentialLoss
+from .two_view.estimate_matches import estimate_matches
+from .two_view.estimate_pair import estimate_pair
+from .two_view.result import NoReliableMatrixError
 
 __version__ = "0.1.0"
 

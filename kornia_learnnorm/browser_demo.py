@@ -16,14 +16,12 @@ import gradio as gr
 import numpy as np
 import torch
 from kornia.geometry.linalg import transform_points
-from numpy.typing import NDArray
 from starlette.datastructures import Headers
 from starlette.middleware import Middleware
 from starlette.responses import PlainTextResponse
 
-from kornia_learnnorm.data.images import read_colour
-from kornia_learnnorm.data.matching.features import DETECTORS
-from kornia_learnnorm.data.matching.matchers import MATCHERS
+from kornia_learnnorm.data.images import Pixels, read_colour
+from kornia_learnnorm.data.matching import features, matchers
 from kornia_learnnorm.data.synthetic.render import render_pair, write_pair
 from kornia_learnnorm.geometry.checks import check_choice
 from kornia_learnnorm.two_view.drawing import INLIER, OUTLIER, blend_images, draw_line, import_matplotlib, stacked
@@ -54,8 +52,6 @@ OFF = ("share", "ssr_mode", "mcp_server", "pwa", "run_history", "enable_monitori
 CSS = "#estimate textarea {font: clamp(8.5px, 2.2vw, 14px) / 1.5 monospace}"
 PROGRESS = gr.Progress()
 log = logging.getLogger(__name__)
-
-Pixels = NDArray[np.uint8]  # RGB, (H, W, 3)
 
 
 class Result(NamedTuple):
@@ -196,8 +192,8 @@ def make_app(detector: str = PairOptions.detector, matcher: str = PairOptions.ma
             options: list[Any] = [
                 gr.Dropdown([*names], value=value, label=label, min_width=150)
                 for label, names, value in (
-                    ("Detector", DETECTORS, detector),
-                    ("Matcher", MATCHERS, matcher),
+                    ("Detector", features.DETECTORS, detector),
+                    ("Matcher", matchers.MATCHERS, matcher),
                     ("Model", MODELS, PairOptions.model),
                     ("Estimator of F", ESTIMATORS, "RANSAC"),
                 )

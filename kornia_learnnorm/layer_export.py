@@ -28,11 +28,12 @@ from kornia_learnnorm.pretrained import own_weights, shipped_weights, weights_fo
 MIN_DYNAMIC_POINTS = 9  # eight correspondences have a solver of their own
 EXAMPLE_BATCH = 2  # sets of the example that is traced; a dynamic size must not be one there
 ESTIMATORS = {layer.model_name: layer for layer in (LearnedEightPoint, LearnedRelativePose, LearnedHomography)}
+Layer = EightPoint | LearnedLayer
 OUTPUTS = ("F_mat", "H_mat", "determined", "weights")  # fields of an estimate, where it has them
 POSE_OUTPUTS = ("E_mat", "R", "t", "determined", "weights")
 
 
-def load_layer(name: str | Path) -> EightPoint | LearnedLayer:
+def load_layer(name: str | Path) -> Layer:
     """Load trained weights, by name or file, as a layer in evaluation mode; a normaliser's inside :class:`EightPoint`.
 
     ``MODULE:FILE`` are those of a normaliser with parts of that module of your own, which is then imported.
@@ -53,10 +54,7 @@ def load_layer(name: str | Path) -> EightPoint | LearnedLayer:
 
 
 def export_layer(
-    layer: EightPoint | LearnedLayer,
-    inputs: Collection[str] = (),
-    num_points: int | None = None,
-    gradients: bool = False,
+    layer: Layer, inputs: Collection[str] = (), num_points: int | None = None, gradients: bool = False
 ) -> ExportedProgram:
     r"""Return the program of a layer, which ``torch.export.save`` writes and any PyTorch process runs.
 
@@ -80,7 +78,7 @@ def export_layer(
         >>> F_mat.shape
         torch.Size([3, 3, 3])
     """
-    if not isinstance(layer, EightPoint | LearnedLayer):
+    if not isinstance(layer, Layer):
         raise TypeError(f"layer must be an EightPoint or a learned layer, got {type(layer)}")
     offered = [name for name in list(inspect.signature(layer.forward).parameters)[2:] if name not in ("K1", "K2")]
     if wrong := [name for name in inputs if name not in offered]:
@@ -104,7 +102,7 @@ def export_layer(
         return torch.export.export(program, arguments, given, dynamic_shapes=shapes, strict=False)
 
 
-def export_networks(layer: EightPoint | LearnedLayer) -> dict[str, Any]:
+def export_networks(layer: Layer) -> dict[str, Any]:
     """Return the networks of a layer as ONNX programs, without the steps around them.
 
     The networks of learned layers, ``stage1`` and so on, map ``features`` (B, N, C), see
@@ -136,7 +134,7 @@ class _Exported(nn.Module):
 
     layer: Any  # an EightPoint or a learned layer, whose `estimate` takes the inputs
 
-    def __init__(self, layer: EightPoint | LearnedLayer, gradients: bool) -> None:
+    def __init__(self, layer: Layer, gradients: bool) -> None:
         super().__init__()
         self.layer, self.gradients = layer, gradients
 
@@ -160,7 +158,6 @@ class _Exported(nn.Module):
 
 
 def _to_onnx(network: nn.Module, example: dict[str, Tensor], outputs: list[str]) -> Any:
-    """Return the ONNX program of a network with dynamic batch and number of points."""
     sizes = {0: Dim("B", min=1), 1: Dim("N", min=2)}
     shapes = {name: {0: sizes[0]} if name == "null_matrix" else sizes for name in example}
     logger = logging.getLogger("torch.onnx")

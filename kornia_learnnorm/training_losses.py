@@ -10,6 +10,7 @@ from kornia_learnnorm.geometry.checks import solve_dtype
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 
 Residual = Callable[[Tensor, Tensor, Tensor], Tensor]  # distances (B, N) of points (B, N, 2) x 2 under (B, 3, 3)
+Heldout = Tensor | None  # (B, M, 2)
 MAX_DISTANCE = 1e4  # pixels; larger distances count as this and send no gradient
 
 
@@ -61,12 +62,7 @@ class EpipolarLoss(nn.Module):
         return f"residual={name}, log={self.log}, heldout_weight={self.heldout_weight:g}, ceiling={self.ceiling:g}"
 
     def forward(
-        self,
-        points1: Tensor,
-        points2: Tensor,
-        F_mat: Tensor,
-        heldout1: Tensor | None = None,
-        heldout2: Tensor | None = None,
+        self, points1: Tensor, points2: Tensor, F_mat: Tensor, heldout1: Heldout = None, heldout2: Heldout = None
     ) -> Tensor:
         """Return the loss, a scalar, of pixels (B, N, 2) and held-out ones (B, M, 2) under matrices (B, 3, 3).
 

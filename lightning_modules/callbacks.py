@@ -17,11 +17,10 @@ from safetensors.torch import save_file
 from torch import Tensor, distributed
 from tqdm import tqdm
 
+from kornia_learnnorm import EightPoint, LearnedNormalizer
 from kornia_learnnorm.data.random_sets import RandomSets, StoreSets, SyntheticSets
 from kornia_learnnorm.data.sources import StoreSamples, SyntheticSamples
-from kornia_learnnorm.estimators.linear import EightPoint
 from kornia_learnnorm.files import atomic_write, explained, short_name
-from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
 from lightning_modules.task import EstimatorTask, SetLoss
 
 MEASURED_STEPS = 10  # steps whose mean time is multiplied, after one that does not count

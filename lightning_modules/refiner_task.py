@@ -6,13 +6,10 @@ import torch
 from kornia.geometry.epipolar import fundamental_from_essential
 from torch import Tensor, nn
 
+from kornia_learnnorm import RANSAC, EightPoint, LearnedEightPoint, LearnedRelativePose, MatchRefiner
 from kornia_learnnorm.data.match_sets import MatchSets
-from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
-from kornia_learnnorm.estimators.learned_relative_pose import LearnedRelativePose
-from kornia_learnnorm.estimators.linear import EightPoint
-from kornia_learnnorm.estimators.match_refiner import MatchRefiner, RefinedMatches
+from kornia_learnnorm.estimators.match_refiner import RefinedMatches
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.ransac.ransac import RANSAC
 from lightning_modules.task import EstimatorTask, Median, cameras_of
 
 TRUE_MATCH = 4.0  # pixels, the largest distance of the found matches that the validation's medians are of

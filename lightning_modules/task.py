@@ -13,15 +13,12 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler, OneCycleLR
 from torchmetrics import CatMetric, MeanMetric, Metric, SumMetric
 
+from kornia_learnnorm import EightPoint, Hartley, LearnedNormalizer, LearnedRelativePose, Whitening
 from kornia_learnnorm.data.match_sets import MatchSets
 from kornia_learnnorm.estimators.learned_layer import LearnedLayer
-from kornia_learnnorm.estimators.learned_relative_pose import LearnedRelativePose
-from kornia_learnnorm.estimators.linear import EightPoint
 from kornia_learnnorm.geometry.checks import solve_dtype
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.metrics.statistics import comparable
-from kornia_learnnorm.normalizers.closed_form import Hartley, Whitening
-from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
 from kornia_learnnorm.training_losses import BoundedEpipolarLoss, InlierLoss, LogEpipolarLoss, LogEssentialLoss
 
 __all__ = ["EstimatorTask", "Median", "SetLoss", "adamw", "cameras_of"]
@@ -78,9 +75,8 @@ class SetLoss(nn.Module):
         if self.pose_weight and sets.K1 is not None and sets.K2 is not None and sets.E_mat is not None:
             calibrated = sets.E_mat.isfinite().flatten(1).all(1)
             eye = torch.eye(3).to(F_mat)  # where unknown: NaN has no derivative that can be dropped
-            K1, K2, true = (
-                torch.where(calibrated[:, None, None], value.to(F_mat), eye) for value in (sets.K1, sets.K2, sets.E_mat)
-            )
+            given = calibrated[:, None, None]
+            K1, K2, true = (torch.where(given, value.to(F_mat), eye) for value in (sets.K1, sets.K2, sets.E_mat))
             share = self.pose_weight * calibrated
             known = (1 - share) * known + share * self.pose(K2.mT @ F_mat @ K1, true)
         if logits is not None and sets.inliers is not None:
@@ -190,9 +186,8 @@ class EstimatorTask(pl.LightningModule):
         self.log("train/skipped", float(skipped))
         self._sets, self._skipped = 0, self._skipped + 1 if skipped else 0
         if self._skipped == MAX_SKIPPED:
-            raise ValueError(
-                f"{MAX_SKIPPED} steps in a row were skipped: no samples, or no finite gradient of the loss"
-            )
+            why = "no samples, or no finite gradient of the loss"
+            raise ValueError(f"{MAX_SKIPPED} steps in a row were skipped: {why}")
 
     def _finite(self, batch: MatchSets) -> tuple[MatchSets, int]:
         """Return the sets that are finite, with the cameras that a pose needs, and how many others there are."""

@@ -175,10 +175,9 @@ def run(args: list[str]) -> dict[str, float]:
     command, *options = with_config_paths(args)
     for message in UNWANTED_WARNINGS:
         warnings.filterwarnings("ignore", message=message)
+    here = Path(__file__).parent
     for name in LOGGERS:
-        logging.getLogger(name).addFilter(
-            lambda log: log.levelno > logging.INFO or Path(log.pathname).parent == Path(__file__).parent
-        )
+        logging.getLogger(name).addFilter(lambda log: log.levelno > logging.INFO or Path(log.pathname).parent == here)
     if options and not options[0].startswith("-"):
         raise ValueError(f"an option expected, got {options[0]!r}; a configuration is given by --config {options[0]}")
     if not any(option.startswith(("--config", "-c", "--model", "--help")) for option in options):

@@ -23,6 +23,7 @@ learnnorm estimate --pairs pairs.txt --out results --estimator learned
 """
 MAX_FAILURES = 5  # failed pairs that are named
 NO_MATRIX, DOUBTFUL = 3, 4  # exit codes where there is no matrix, or reasons to doubt it
+EXIT_CODES = "exit codes: 0 solved, 2 wrong use or input, 3 no matrix, 4 with warnings"
 HINT = "more accurate, but slower: --detector aliked --matcher lightglue, whose weights are downloaded once (50 MB)"
 
 
@@ -30,9 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``learnnorm estimate`` to a parser."""
     options = many_pairs.PairOptions()
     parser.usage = "%(prog)s IMG1 IMG2 [options]\n       %(prog)s --pairs LIST --out FOLDER [options]"
-    parser.description = (
-        f"{parser.description}\nexit codes: 0 solved, 2 wrong use or input, 3 no matrix, 4 with warnings"
-    )
+    parser.description = f"{parser.description}\n{EXIT_CODES}"
     parser.add_argument("images", metavar="IMG", type=Path, nargs="*", help=argparse.SUPPRESS)  # in the usage
     parser.add_argument("--out", metavar="PATH", type=Path, help="picture of the matches; with --pairs, a folder")
     parser.add_argument("--json", metavar="FILE", help="write the result to this file; -: standard output")
@@ -183,7 +182,6 @@ def _check_options(args: argparse.Namespace) -> None:
 
 
 def _check_many(args: argparse.Namespace) -> None:
-    """Raise ValueError for options that do not go with a list of pairs."""
     given = {"image files": args.images, "--json": args.json, "--mask": args.mask}
     if wrong := [name for name, value in given.items() if value]:
         raise ValueError(f"--pairs {args.pairs}: cannot be combined with {' and '.join(wrong)}")

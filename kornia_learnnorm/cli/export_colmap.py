@@ -9,12 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kornia_learnnorm.cli.match import add_matching_arguments, print_skipped
-from kornia_learnnorm.data.cameras import read_camera
+from kornia_learnnorm.data import cameras, hloc
 from kornia_learnnorm.data.datasets.pairing import choose_pairs
 from kornia_learnnorm.data.datasets.reading import read_dataset
-from kornia_learnnorm.data.hloc import read_hloc
-from kornia_learnnorm.data.matching.match_store import MatchOptions, collect_matches
-from kornia_learnnorm.data.matching.workers import check_jobs
+from kornia_learnnorm.data.matching import match_store, workers
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.two_view.colmap_database import THRESHOLD, check_database, check_images, export_colmap
@@ -51,8 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Match the images where no matches are given, into a store beside the database, and write the database."""
     check_database(args.out)
-    check_jobs(args.jobs)
-    K = None if args.K is None else read_camera(args.K)
+    workers.check_jobs(args.jobs)
+    K = None if args.K is None else cameras.read_camera(args.K)
     layer = None if args.weights is None else LearnedEightPoint.from_pretrained(args.weights)
     check_settings(args.threshold, args.seed, layer)
     if args.out.suffix == MATCHES:
@@ -76,13 +74,13 @@ def _matches(args: argparse.Namespace, K: NDArray[np.float64] | None) -> Corresp
     if len(args.matches) > 2:
         raise ValueError(f"--matches: a store, or hloc's features and matches expected, got {len(args.matches)} files")
     if args.matches:
-        return read_store(*args.matches) if len(args.matches) == 1 else read_hloc(*args.matches)
+        return read_store(*args.matches) if len(args.matches) == 1 else hloc.read_hloc(*args.matches)
     frames = read_dataset("folder", args.root)
     pairs, pairing = choose_pairs(frames, args.gap, args.pairs)
     check_images(args.root, [frame.name for frame in frames], K, args.single_camera)
     print(f"{len(frames)} images; {len(pairs)} pairs ({pairing})", file=sys.stderr)
     store = args.out.with_suffix(MATCHES)
-    options = MatchOptions(args.detector, args.num_features, args.matcher, max_matches=None)
+    options = match_store.MatchOptions(args.detector, args.num_features, args.matcher, max_matches=None)
     about = {"dataset": str(args.root), "pairs": pairing}
-    print_skipped(collect_matches(pairs, store, options, about, args.jobs, args.dask))
+    print_skipped(match_store.collect_matches(pairs, store, options, about, args.jobs, args.dask))
     return read_store(store)

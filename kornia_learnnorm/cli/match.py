@@ -10,10 +10,8 @@ import numpy as np
 from kornia_learnnorm.data.datasets.frames import resize_frames
 from kornia_learnnorm.data.datasets.pairing import choose_pairs
 from kornia_learnnorm.data.datasets.reading import DATASETS, missing_ground_truth, read_dataset
-from kornia_learnnorm.data.matching.features import DETECTORS
+from kornia_learnnorm.data.matching import features, matchers, workers
 from kornia_learnnorm.data.matching.match_store import MatchOptions, collect_matches
-from kornia_learnnorm.data.matching.matchers import MATCHERS
-from kornia_learnnorm.data.matching.workers import check_jobs
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.writer import check_target
 
@@ -51,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_feature_arguments(parser: argparse._ActionsContainer) -> None:
     """Add the arguments that say which features are matched and how."""
-    for option, names in (("detector", DETECTORS), ("matcher", MATCHERS)):
+    for option, names in (("detector", features.DETECTORS), ("matcher", matchers.MATCHERS)):
         default = getattr(MatchOptions, option)
         text = " ".join(f"{name} (default)" if name == default else name for name in names)
         parser.add_argument(f"--{option}", metavar="NAME", choices=names, default=default, help=text)
@@ -77,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
     if args.out.suffix not in ENDINGS:
         raise ValueError(f"--out {args.out}: expected the name of a store, which ends in {' or '.join(ENDINGS)}")
     check_target(args.out)
-    check_jobs(args.jobs)
+    workers.check_jobs(args.jobs)
     given = {name: getattr(args, name) for name in READER_OPTIONS if getattr(args, name) is not None}
     frames = read_dataset(args.reader, args.root, **given)
     if args.resize:

@@ -21,14 +21,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write ``report.md``, ``report.html`` and the pictures; print the summary and the tables that fit."""
     with json_tables(args, [str(args.folder / name) for name in ("run.json", "report.md", "report.html")]) as tables:
-        report = write_report(args.folder)
-        tables += report.tables
+        summary, made, missing = write_report(args.folder)
+        tables += made
         if args.json != "-":
-            for text in report.summary:
+            for text in summary:
                 print(text.replace("**", "").replace("`", ""), end="\n\n")
-            print_tables(report.tables, args.folder / "report.html")
-    if report.missing:
-        print(f"not there yet, so left out: {'; '.join(report.missing)}", file=sys.stderr)
+            print_tables(tables, args.folder / "report.html")
+    if missing:
+        print(f"not there yet, so left out: {'; '.join(missing)}", file=sys.stderr)
     wrote = f"wrote {args.folder / 'report.md'} and {args.folder / 'report.html'}"
     print(wrote, file=sys.stderr if args.json == "-" else sys.stdout)
     return 0

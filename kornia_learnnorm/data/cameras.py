@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kornia_learnnorm.data.datasets.colmap import FIRST_DISTORTION, read_pinhole
-from kornia_learnnorm.data.datasets.kitti import read_calibration
+from kornia_learnnorm.data.datasets import colmap, kitti
 from kornia_learnnorm.data.datasets.textfiles import camera_matrix
 from kornia_learnnorm.data.images import image_size, open_image
 
@@ -34,9 +33,9 @@ def read_camera(text: str, image: str | Path | None = None) -> NDArray[np.float6
         if "," not in text or Path(text).exists():
             content = Path(text).read_text(encoding="utf-8")
             if any(line.startswith(f"{KITTI_CAMERA}:") for line in content.splitlines()):
-                return read_calibration(Path(text), KITTI_CAMERA)[0]
-            if not FIRST_DISTORTION.keys().isdisjoint(content.split()):
-                return read_pinhole(Path(text))
+                return kitti.read_calibration(Path(text), KITTI_CAMERA)[0]
+            if not colmap.FIRST_DISTORTION.keys().isdisjoint(content.split()):
+                return colmap.read_pinhole(Path(text))
         numbers = np.array(content.replace(",", " ").split(), float)
     except FileNotFoundError as error:
         raise FileNotFoundError(f"camera {text}: no such file; {expected}") from error

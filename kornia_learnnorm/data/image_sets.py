@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Generator, Tensor
 
-from kornia_learnnorm.data.images import Size, image_size, read_image, reduced_size
+from kornia_learnnorm.data.images import Pixels, Size, image_size, read_image, reduced_size
 from kornia_learnnorm.data.match_sets import MatchSets
 from kornia_learnnorm.data.random_sets import StoreSets
 from kornia_learnnorm.data.sources import expand_path
@@ -79,7 +78,7 @@ class ImageSets(StoreSets):
 
     def _draw(
         self, index: int, num_points: int, ratio: float | None, generator: Generator
-    ) -> tuple[Tensor, list[NDArray[np.uint8]], tuple[Tensor, Tensor, Tensor]]:
+    ) -> tuple[Tensor, list[Pixels], tuple[Tensor, Tensor, Tensor]]:
         """Return points of both views (2 N, 4), both images and cameras of a pair."""
         pair = self._pairs[index]
         rows = pair.passing(ratio)
@@ -122,7 +121,7 @@ def _stem(name: str) -> str:
     return re.sub(r"(\.[^\d.][^.]*)+$", "", name)
 
 
-def _mapped(image: NDArray[np.uint8], symmetry: int) -> tuple[NDArray[np.uint8], Tensor]:
+def _mapped(image: Pixels, symmetry: int) -> tuple[Pixels, Tensor]:
     """Return an image (H, W) under a symmetry of the square, and the transform (3, 3) of its pixels."""
     A, (height, width) = torch.eye(3), image.shape
     if symmetry & 1:
@@ -134,7 +133,7 @@ def _mapped(image: NDArray[np.uint8], symmetry: int) -> tuple[NDArray[np.uint8],
     return image, A
 
 
-def _padded(image: NDArray[np.uint8], shape: Sequence[int]) -> Tensor:
+def _padded(image: Pixels, shape: Sequence[int]) -> Tensor:
     """Return an image with its last row and column repeated up to a height and width, (1, H, W)."""
     missing = [(0, wanted - side) for wanted, side in zip(shape, image.shape, strict=True)]
     return torch.from_numpy(np.pad(image, missing, "edge"))[None]

@@ -20,6 +20,7 @@ __all__ = ["check_grey", "content_mask", "image_size", "read_colour", "read_imag
 
 Size = tuple[int, int]  # width and height, pixels
 Array = NDArray[Any]
+Pixels = NDArray[np.uint8]  # grey values (H, W) or red, green and blue (H, W, 3)
 
 # Weights of red, green and blue, and an offset that turns Pillow's rounding into rounding down: the integer arithmetic
 # of libpng, so that a PNG has the grey values that OpenCV reads.
@@ -43,7 +44,7 @@ def import_pillow() -> Any:
     return import_extra("PIL.Image", "images", "reading images")
 
 
-def check_grey(image: NDArray[np.uint8], colour: bool = False) -> None:
+def check_grey(image: Pixels, colour: bool = False) -> None:
     """Raise TypeError or ValueError unless an image is an array of grey values (H, W), or colours (H, W, 3), uint8."""
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
         raise TypeError(f"an image must be an array of uint8, got {getattr(image, 'dtype', type(image))}")
@@ -53,7 +54,7 @@ def check_grey(image: NDArray[np.uint8], colour: bool = False) -> None:
         raise ValueError(f"an image must be {expected}, got {image.shape}{hint}")
 
 
-def read_image(path: str | Path, max_size: int | None = None) -> NDArray[np.uint8]:
+def read_image(path: str | Path, max_size: int | None = None) -> Pixels:
     """Return the grey values :math:`(H, W)`, uint8, of an image file, rotated by its EXIF orientation.
 
     They are those of OpenCV's ``IMREAD_GRAYSCALE``, up to a level higher in other formats than PNG and JPEG (two for
@@ -70,13 +71,12 @@ def read_image(path: str | Path, max_size: int | None = None) -> NDArray[np.uint
     return _read(Path(path), "L", max_size)
 
 
-def read_colour(path: str | Path, max_size: int | None = None) -> NDArray[np.uint8]:
+def read_colour(path: str | Path, max_size: int | None = None) -> Pixels:
     """Return the red, green and blue of an image file with shape :math:`(H, W, 3)`, uint8; see :func:`read_image`."""
     return _read(Path(path), "RGB", max_size)
 
 
-def _read(path: Path, mode: str, max_size: int | None) -> NDArray[np.uint8]:
-    """Decode an image file; errors name the file and what is wrong with it."""
+def _read(path: Path, mode: str, max_size: int | None) -> Pixels:
     if not path.exists():
         raise FileNotFoundError(f"image {path} does not exist")
     reduced_size((1, 1), max_size)  # checks the limit before a file is read
@@ -92,7 +92,7 @@ def _read(path: Path, mode: str, max_size: int | None) -> NDArray[np.uint8]:
         raise ValueError(f"image {path} cannot be decoded: {path.stat().st_size} bytes, {reason}") from error
 
 
-def _decode(path: Path, mode: str, max_size: int | None) -> NDArray[np.uint8]:
+def _decode(path: Path, mode: str, max_size: int | None) -> Pixels:
     """Return the pixels in a mode, L or RGB; TypeError for pixels of more than eight bits."""
     with open_image(path) as image:
         image.verify()  # the checksums of a PNG, which decoding skips
@@ -182,7 +182,7 @@ def reduced_size(size: Size, max_size: int | None) -> Size:
     return width, height
 
 
-def resize_image(image: NDArray[np.uint8], max_size: int | None) -> NDArray[np.uint8]:
+def resize_image(image: Pixels, max_size: int | None) -> Pixels:
     """Return grey values (H, W) or colours (H, W, 3) reduced as by :func:`read_image`; a small image as it is."""
     size = reduced_size((image.shape[1], image.shape[0]), max_size)
     return image if size == image.shape[1::-1] else np.array(_reduce(import_pillow().fromarray(image), size))
@@ -216,7 +216,7 @@ def read_mask(path: str | Path, size: Size) -> NDArray[np.bool_]:
     return mask
 
 
-def content_mask(image: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
+def content_mask(image: Pixels) -> NDArray[np.bool_] | None:
     """Return which pixels are inside of a black frame, (H, W) bool; None without one, or if all pixels are black.
 
     The frame is made of the outermost rows and columns with grey values of at most 2, of which 95 % or more are equal;
@@ -232,7 +232,7 @@ def content_mask(image: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
     return None if mask.all() else mask
 
 
-def _black_rows(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def _black_rows(image: Pixels) -> NDArray[np.bool_]:
     black = np.asarray(image.max(1) <= MAX_BLACK)
     rows = image[black]
     black[black] = (rows != np.median(rows, 1, keepdims=True)).mean(1) <= MAX_UNEVEN if len(rows) else False

@@ -3,9 +3,9 @@
 from typing import NamedTuple, Self
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
-from kornia_learnnorm.data.store import CorrespondenceStore, passes_ratio_test
+from kornia_learnnorm.data.store import CorrespondenceStore, MaxRatio, passes_ratio_test
 from kornia_learnnorm.estimators.linear import find_fundamental
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.normalizers.closed_form import Identity
@@ -53,19 +53,14 @@ def plain_residual(points1: Tensor, points2: Tensor) -> Tensor:
 
 
 def draw_samples(
-    store: CorrespondenceStore,
-    generator: torch.Generator,
-    size: int = 8,
-    max_ratio: float | None = RATIO,
-    num_heldout: int = 0,
-    require_heldout: bool = True,
+    store: CorrespondenceStore, generator: Generator, size: int = 8, max_ratio: MaxRatio = RATIO, num_heldout: int = 0
 ) -> MatchSets:
     """Draw samples: shuffle the correspondences of each pair and split them into sets of ``size``, without the rest.
 
     The samples are float32, in the order of the pairs. ``max_ratio`` is exclusive; None keeps all. The ``num_heldout``
     correspondences of a sample are drawn with replacement from its pair; they are not in the sample and pass the ratio
-    test of 0.8, whatever ``max_ratio`` is. ValueError if ``size`` is below 8, no pair fills a sample, or, with
-    ``require_heldout``, a pair has no correspondence to hold out; without, the held-out points are NaN.
+    test of 0.8, whatever ``max_ratio`` is; NaN where the pair has none. ValueError if ``size`` is below 8, or no pair
+    fills a sample.
     """
     if size < 8:
         raise ValueError(f"a sample needs at least 8 correspondences, got size={size}")
@@ -82,9 +77,6 @@ def draw_samples(
     pool = torch.from_numpy(passes_ratio_test(store.ratio, RATIO)).nonzero()[:, 0]  # pair after pair
     count, sample_pair = torch.bincount(pair[pool], minlength=len(store)), pair[rows[:, 0]]
     first, passing = (count.cumsum(0) - count)[sample_pair], count[sample_pair]
-    if num_heldout and require_heldout and (few := int(passing.min())) <= size:
-        expected = f"more than the {size} of a sample expected"
-        raise ValueError(f"held-out correspondences: a pair has only {few} with ratio below {RATIO}, {expected}")
     cut, rest = points[rows], points.new_full((len(rows), num_heldout, 4), torch.nan)
     drawable = passing > size
     samples, first, count = rows[drawable], first[drawable, None], passing[drawable, None]

@@ -13,7 +13,7 @@ from torch import Generator, Tensor
 from kornia_learnnorm.data.images import Size
 from kornia_learnnorm.data.match_sets import MatchSets
 from kornia_learnnorm.data.sources import SEEDS_PER_RUN, Block, block_generator, check_draws, expand_path
-from kornia_learnnorm.data.store import CorrespondenceStore, passes_ratio_test, read_store
+from kornia_learnnorm.data.store import CorrespondenceStore, MaxRatio, passes_ratio_test, read_store
 from kornia_learnnorm.data.synthetic.draws import log_uniform, normal, uniform
 from kornia_learnnorm.data.synthetic.random_matches import SyntheticMatches, random_matches
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
@@ -139,8 +139,6 @@ class StoreSets:
 
 
 class _Pair:
-    """The matches of one pair of a store."""
-
     def __init__(self, store: CorrespondenceStore, index: int, labels: bool) -> None:
         rows = store.rows(index)
         points1, points2 = (torch.from_numpy(points[rows]).double() for points in (store.points1, store.points2))
@@ -161,7 +159,7 @@ class _Pair:
         # indices of the matches that supervise
         self.heldout = filtered[self.distance[filtered] < INLIER_THRESHOLD] if self.labelled else self.passing(None)
 
-    def passing(self, max_ratio: float | None) -> Tensor:
+    def passing(self, max_ratio: MaxRatio) -> Tensor:
         """Return the indices of the matches that pass the ratio test."""
         return torch.from_numpy(passes_ratio_test(self.ratio, max_ratio)).nonzero()[:, 0]
 

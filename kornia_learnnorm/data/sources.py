@@ -98,7 +98,7 @@ class StoreSamples:
             held = store.read((own - first).tolist()) if len(own) else None
             for ratio, passing in zip(self.max_ratios, self._passing, strict=True):
                 if held is not None and passing[own].max() >= size:
-                    part = draw_samples(held, generator, size, ratio, self.num_heldout, require_heldout=False)
+                    part = draw_samples(held, generator, size, ratio, self.num_heldout)
                     parts.append(part._replace(pair=torch.from_numpy(own)[part.pair]))
         samples = MatchSets(*(torch.cat([part[field] for part in parts]) for field in range(5)))  # type: ignore[misc]
         samples = samples.select(samples.heldout1.isfinite().flatten(1).all(1))  # NaN of pairs with too few to hold out

@@ -16,6 +16,7 @@ from kornia_learnnorm.files import explained
 from kornia_learnnorm.optional import import_extra
 
 Array = NDArray[np.float32]
+MaxRatio = float | None  # limit of Lowe's ratio, exclusive; None for no limit
 FORMAT = "correspondences"  # attribute of the file
 VERSION = 1  # attribute of the file
 READING = "reading HDF5 files"  # what needs h5py, in messages
@@ -61,18 +62,18 @@ class CorrespondenceStore:
     def __len__(self) -> int:
         return len(self.offsets) - 1
 
-    def rows(self, pair: int, max_ratio: float | None = None) -> NDArray[np.int64]:
+    def rows(self, pair: int, max_ratio: MaxRatio = None) -> NDArray[np.int64]:
         """Return the rows (N,) of the correspondences of :meth:`matches`, in increasing order."""
         rows = np.arange(self.offsets[pair], self.offsets[pair + 1])
         return rows[passes_ratio_test(self.ratio[rows], max_ratio)]
 
-    def matches(self, pair: int, max_ratio: float | None = None) -> tuple[Array, Array, Array]:
+    def matches(self, pair: int, max_ratio: MaxRatio = None) -> tuple[Array, Array, Array]:
         """Return points1 (N, 2), points2 (N, 2) and ratio (N,) of a pair: those that pass the ratio test, or all."""
         rows = self.rows(pair, max_ratio)
         return self.points1[rows], self.points2[rows], self.ratio[rows]
 
 
-def passes_ratio_test(ratio: Array, max_ratio: float | None) -> NDArray[np.bool_]:
+def passes_ratio_test(ratio: Array, max_ratio: MaxRatio) -> NDArray[np.bool_]:
     """Return which matches (N,) have a ratio below a limit, None for no limit, or no ratio, NaN."""
     return np.asarray(~(ratio >= (np.inf if max_ratio is None else max_ratio)))
 
@@ -146,7 +147,7 @@ class StoreReader:
         offsets = np.concatenate([[0], np.diff(self.offsets)[list(pairs)].cumsum()]).astype(np.int64)
         return CorrespondenceStore(offsets=offsets, names=names, **arrays, **about, provenance=provenance)
 
-    def passing(self, max_ratio: float | None) -> NDArray[np.int64]:
+    def passing(self, max_ratio: MaxRatio) -> NDArray[np.int64]:
         """Return how many correspondences of each pair have a ratio below ``max_ratio``, all if it is None, (P,)."""
         if max_ratio is None:
             return np.diff(self.offsets)

@@ -6,12 +6,9 @@ import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
-from kornia_learnnorm.geometry.checks import check_correspondences
-from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.geometry.dlt import design_matrix
-from kornia_learnnorm.geometry.matrices import nearest_rank2
+from kornia_learnnorm import symmetric_epipolar_distance
+from kornia_learnnorm.geometry import checks, dlt, matrices, transforms
 from kornia_learnnorm.geometry.problem import LinearProblem
-from kornia_learnnorm.geometry.transforms import transform_fundamental
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.normalizers.normalizer import Normalizer, normalizing_transforms
 
@@ -41,7 +38,7 @@ def diagnose(points1: Tensor, points2: Tensor, normalizer: Normalizer) -> Diagno
         >>> diagnose(torch.rand(2, 8, 2), torch.rand(2, 8, 2), Hartley()).distance1
         tensor([1.4142, 1.4142], dtype=torch.float64)
     """
-    check_correspondences(points1, points2)
+    checks.check_correspondences(points1, points2)
     problem = LinearProblem.from_points(points1, points2, None, Fundamental())
     return diagnose_in_coordinates(problem, *normalizing_transforms(normalizer, problem))
 
@@ -51,8 +48,8 @@ def diagnose_in_coordinates(problem: LinearProblem, T1: Tensor, T2: Tensor) -> D
     points1, points2 = problem.points1, problem.points2
     x1, x2 = convert_points_to_homogeneous(points1) @ T1.mT, convert_points_to_homogeneous(points2) @ T2.mT
     F_hat = problem.solve_in(T1, T2)[0]
-    matrices = (transform_fundamental(F_mat, T1, T2) for F_mat in (F_hat, nearest_rank2(F_hat)))
-    before, after = (symmetric_epipolar_distance(points1, points2, F_mat).mean(-1) for F_mat in matrices)
-    d, r = torch.linalg.svdvals(design_matrix(x1, x2)), torch.linalg.svdvals(F_hat)
+    both = (transforms.transform_fundamental(F_mat, T1, T2) for F_mat in (F_hat, matrices.nearest_rank2(F_hat)))
+    before, after = (symmetric_epipolar_distance(points1, points2, F_mat).mean(-1) for F_mat in both)
+    d, r = torch.linalg.svdvals(dlt.design_matrix(x1, x2)), torch.linalg.svdvals(F_hat)
     distance1, distance2 = (x[..., :2].norm(dim=-1).mean(-1) for x in (x1, x2))
     return Diagnostics(d[..., 0] / d[..., 7], r[..., 1] / r[..., 2], distance1, distance2, 1 - before / after)

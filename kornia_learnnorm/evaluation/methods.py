@@ -10,17 +10,15 @@ from typing import Any, Literal, NamedTuple
 
 from torch import Tensor
 
+from kornia_learnnorm import Hartley, Identity, LearnedNormalizer, ReweightedWhitening, Whitening, refine_fundamental
 from kornia_learnnorm.estimators.learned_layer import FORMAT as LAYER_FORMAT
 from kornia_learnnorm.estimators.linear import solve_in_coordinates
-from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.evaluation.searched_normalizer import SearchedNormalizer
 from kornia_learnnorm.files import explained, short_name
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.fundamental import Fundamental
-from kornia_learnnorm.normalizers.closed_form import Hartley, Identity, Whitening
-from kornia_learnnorm.normalizers.learned_normalizer import FORMAT, LearnedNormalizer
+from kornia_learnnorm.normalizers.learned_normalizer import FORMAT
 from kornia_learnnorm.normalizers.normalizer import Normalizer, normalizing_transforms
-from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 from kornia_learnnorm.optional import working_folder_importable
 from kornia_learnnorm.pretrained import own_weights, shipped_weights, weights_format, weights_path
 

@@ -3,14 +3,13 @@ r"""The per-sample optimum of the normalisation: how small a normaliser can make
 import torch
 from torch import Tensor, nn
 
+from kornia_learnnorm import ReweightedWhitening, symmetric_epipolar_distance
 from kornia_learnnorm.estimators.linear import solve_in_coordinates
 from kornia_learnnorm.geometry.checks import weighted_mean
-from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import spd_transform
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.normalizers.normalizer import Normalizer, ProblemNormalizer, transforms_of
-from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 
 NUM_PARAMETERS = 5  # of each view, as spd_transform takes them
 MAX_PARAMETER = 3.0  # beyond it rounding errors of F would pass for gains

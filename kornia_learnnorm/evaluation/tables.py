@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.files import short_name
-from kornia_learnnorm.metrics.poses import mean_average_accuracy, pose_auc
-from kornia_learnnorm.metrics.statistics import bootstrap_interval, median, paired_bootstrap
+from kornia_learnnorm.metrics import poses, statistics
 from kornia_learnnorm.optional import import_extra
 
 RESAMPLES = 2000  # bootstrap resamples of a paired test
@@ -67,7 +66,7 @@ def number(value: float, spec: str = ".3f") -> Cell:
 
 def median_number(values: Tensor, spec: str = ".3f") -> Cell:
     """Return the median of the values that are not NaN."""
-    return number(median(values.flatten()).item(), spec)
+    return number(statistics.median(values.flatten()).item(), spec)
 
 
 def mean_share(values: Tensor, pair: Tensor) -> Cell:
@@ -78,7 +77,7 @@ def mean_share(values: Tensor, pair: Tensor) -> Cell:
     found = Number(100 * values.mean().item(), ".1f")
     if len(torch.unique(pair)) < MIN_BOOTSTRAP_PAIRS:
         return found
-    low, high = bootstrap_interval(values, pair)
+    low, high = statistics.bootstrap_interval(values, pair)
     return found._replace(interval=(100 * low, 100 * high))
 
 
@@ -94,7 +93,7 @@ def paired_change(values: Tensor, baseline: Tensor, pair: Tensor | None = None, 
     show, spec = (percent_change, "+.1f") if logarithms else (float, "+.3f")
     if len(torch.unique(pair[valid])) < MIN_BOOTSTRAP_PAIRS:
         return Number(show((values - baseline)[valid].mean().item()), spec)
-    found = paired_bootstrap(values[valid], baseline[valid], pair[valid], draws=RESAMPLES)
+    found = statistics.paired_bootstrap(values[valid], baseline[valid], pair[valid], draws=RESAMPLES)
     return Number(show(found.mean), spec, (show(found.low), show(found.high)), found.p_value)
 
 
@@ -104,7 +103,7 @@ def pose_numbers(rotation_error: Tensor, translation_error: Tensor) -> list[Cell
     error = error[~error.isnan()]
     if len(error) == 0:
         return [""] * len(POSE_HEADER)
-    return [Number(100 * value, ".1f") for value in (*pose_auc(error), mean_average_accuracy(error))]
+    return [Number(100 * value, ".1f") for value in (*poses.pose_auc(error), poses.mean_average_accuracy(error))]
 
 
 class Table(NamedTuple):

@@ -181,12 +181,11 @@ def test_bad_arguments(store):
     for arguments, message in [
         ({"size": 7}, "size=7"),
         ({"max_ratio": 0.1}, "no pair of the store"),
-        ({"size": 96, "max_ratio": None, "num_heldout": 4}, "held-out correspondences: a pair has only"),
     ]:
         raises(ValueError, message, draw_samples, store, seeded(), **arguments)
 
 
 def test_too_few_to_hold_out(store):
-    samples = draw_samples(store, seeded(), size=96, max_ratio=None, num_heldout=4, require_heldout=False)
+    samples = draw_samples(store, seeded(), size=96, max_ratio=None, num_heldout=4)
     assert samples.heldout1.isnan().any()
     assert torch.equal(samples.points1, draw_samples(store, seeded(), size=96, max_ratio=None).points1)

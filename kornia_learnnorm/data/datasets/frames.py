@@ -11,7 +11,7 @@ from kornia.geometry.epipolar import cross_product_matrix, fundamental_from_esse
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kornia_learnnorm.data.images import Size, import_cv2, read_colour, read_image, scaling
+from kornia_learnnorm.data.images import Pixels, Size, import_cv2, read_colour, read_image, scaling
 
 
 def fundamental_from_motion(K1: Tensor, K2: Tensor, R: Tensor, t: Tensor) -> Tensor:
@@ -75,7 +75,7 @@ def resize_frames(frames: Iterable[Frame], size: Size) -> list[Frame]:
     return [replace(frame, resized=size) for frame in frames]
 
 
-def read_frame(frame: Frame, colour: bool = False) -> NDArray[np.uint8]:
+def read_frame(frame: Frame, colour: bool = False) -> Pixels:
     """Return grey values (H, W) or colours (H, W, 3) of a frame as it is matched: undistorted, resized."""
     cv2 = import_cv2()
     image = (read_colour if colour else read_image)(frame.path)

@@ -7,12 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from kornia_learnnorm.data.datasets.cambridge import read_cambridge
-from kornia_learnnorm.data.datasets.colmap import read_colmap
+from kornia_learnnorm.data.datasets import cambridge, colmap, kitti, tum
 from kornia_learnnorm.data.datasets.frames import Frame
-from kornia_learnnorm.data.datasets.kitti import read_kitti
 from kornia_learnnorm.data.datasets.sequences import sequence_folders, split_sequences
-from kornia_learnnorm.data.datasets.tum import read_tum
 from kornia_learnnorm.data.images import image_size
 
 __all__ = ["read_folder"]
@@ -39,11 +36,11 @@ def read_folder(root: str | Path) -> list[Frame]:
 
 # name: title, reader, and the options that the reader takes
 DATASETS: dict[str, tuple[str, Callable[..., list[Frame]], tuple[str, ...]]] = {
-    "kitti": ("KITTI odometry", read_kitti, ("sequences", "split", "camera")),
-    "tum": ("TUM RGB-D", read_tum, ("sequences", "split", "max_difference")),
-    "cambridge": ("Cambridge Landmarks", read_cambridge, ("split",)),
+    "kitti": ("KITTI odometry", kitti.read_kitti, ("sequences", "split", "camera")),
+    "tum": ("TUM RGB-D", tum.read_tum, ("sequences", "split", "max_difference")),
+    "cambridge": ("Cambridge Landmarks", cambridge.read_cambridge, ("split",)),
     "folder": ("images of", read_folder, ()),
-    "colmap": ("COLMAP model", lambda root, model: read_colmap(model, root), ("model",)),
+    "colmap": ("COLMAP model", lambda root, model: colmap.read_colmap(model, root), ("model",)),
 }
 
 

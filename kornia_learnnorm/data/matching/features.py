@@ -14,7 +14,7 @@ import torch
 from kornia.feature import ALIKED, DISK, KeyNetAffNetHardNet, XFeat, laf_from_center_scale_ori
 from numpy.typing import NDArray
 
-from kornia_learnnorm.data.images import check_grey, import_cv2
+from kornia_learnnorm.data.images import Pixels, check_grey, import_cv2
 
 SIFT_OFFSET = 0.25  # pixels; OpenCV's keypoints are this far to the right and down of what they are found on
 MASK_MARGIN = 8  # pixels along each axis; a feature nearer to a masked pixel is of the mask's edge
@@ -34,7 +34,7 @@ class Features(NamedTuple):
     lafs: NDArray[np.float32] | None = None
 
 
-def detect_sift(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
+def detect_sift(image: Pixels, num_features: int = 4000) -> Features:
     """Return the strongest SIFT features, with those that tie with the weakest; descriptors uint8, 128 columns.
 
     ``image`` has grey values :math:`(H, W)`, uint8; TypeError or ValueError for others, or if ``num_features`` is below
@@ -51,14 +51,14 @@ def detect_sift(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
     return Features(found[0, :, :2].numpy(), rows, (image.shape[1], image.shape[0]), lafs)
 
 
-def detect_rootsift(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
+def detect_rootsift(image: Pixels, num_features: int = 4000) -> Features:
     """Return :func:`detect_sift` with RootSIFT descriptors, float32 (R. Arandjelovic and A. Zisserman, CVPR 2012)."""
     features = detect_sift(image, num_features)
     rows = features.descriptors.astype(np.float32)
     return features._replace(descriptors=np.sqrt(rows / np.maximum(rows.sum(1, keepdims=True), 1.0)))
 
 
-def detect_aliked(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
+def detect_aliked(image: Pixels, num_features: int = 4000) -> Features:
     """Return the features of Kornia's ALIKED, n16 (X. Zhao et al., IEEE TIM 2023), 128 columns of float32.
 
     ``image`` has grey values :math:`(H, W)` or colours :math:`(H, W, 3)`, uint8. Errors are those of
@@ -70,7 +70,7 @@ def detect_aliked(image: NDArray[np.uint8], num_features: int = 4000) -> Feature
     return _features(image, found.keypoints, found.descriptors)
 
 
-def detect_disk(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
+def detect_disk(image: Pixels, num_features: int = 4000) -> Features:
     """Return the features of Kornia's DISK (M. Tyszkiewicz et al., NeurIPS 2020); as :func:`detect_aliked`."""
     _check(image, num_features, colour=True)
     with torch.inference_mode():
@@ -79,14 +79,14 @@ def detect_disk(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
     return _features(image, found.keypoints, found.descriptors)
 
 
-def detect_xfeat(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
+def detect_xfeat(image: Pixels, num_features: int = 4000) -> Features:
     """Return the features of Kornia's XFeat (G. Potje et al., CVPR 2024), 64 columns; as :func:`detect_aliked`."""
     _check(image, num_features, colour=True)
     found = pretrained("XFeat", XFeat.from_pretrained).detectAndCompute(_tensor(image), num_features)[0]
     return _features(image, found["keypoints"], found["descriptors"])
 
 
-def detect_keynet(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
+def detect_keynet(image: Pixels, num_features: int = 4000) -> Features:
     """Return the features of Kornia's KeyNet, AffNet and HardNet of a grey image; otherwise as :func:`detect_aliked`.
 
     A. Barroso-Laguna et al., ICCV 2019; D. Mishkin et al., ECCV 2018; A. Mishchuk et al., NIPS 2017.
@@ -123,7 +123,7 @@ def check_mask(mask: NDArray[np.bool_], size: tuple[int, int]) -> None:
 
 
 # names on the command line
-DETECTORS: dict[str, Callable[[NDArray[np.uint8], int], Features]] = {
+DETECTORS: dict[str, Callable[[Pixels, int], Features]] = {
     "sift": detect_sift,
     "rootsift": detect_rootsift,
     "aliked": detect_aliked,
@@ -159,16 +159,16 @@ def pretrained(name: str, load: Callable[..., Any], *args: Any) -> Any:
         raise MissingWeightsError(text) from error
 
 
-def _features(image: NDArray[np.uint8], points: torch.Tensor, descriptors: torch.Tensor) -> Features:
+def _features(image: Pixels, points: torch.Tensor, descriptors: torch.Tensor) -> Features:
     return Features(points.float().numpy(), descriptors.numpy(), (image.shape[1], image.shape[0]))
 
 
-def _tensor(image: NDArray[np.uint8]) -> torch.Tensor:
+def _tensor(image: Pixels) -> torch.Tensor:
     """Return grey values or colours in [0, 1], (1, C, H, W)."""
     return torch.from_numpy(np.atleast_3d(image)).permute(2, 0, 1)[None].float() / 255.0
 
 
-def _check(image: NDArray[np.uint8], num_features: int, colour: bool = False) -> None:
+def _check(image: Pixels, num_features: int, colour: bool = False) -> None:
     check_grey(image, colour)
     if num_features < 2:
         raise ValueError(f"num_features must be at least 2, got {num_features}")

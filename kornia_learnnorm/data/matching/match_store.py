@@ -127,7 +127,6 @@ def collect_matches(
 
 
 def _digest(pairs: Sequence[FramePair]) -> str:
-    """Return a hash of the pairs: names, sizes, cameras and poses."""
     digest = sha256()
     for frame in chain(*pairs):
         digest.update(f"{frame.name}\n{frame.size} {frame.matched_size} {frame.distortion}\n".encode())

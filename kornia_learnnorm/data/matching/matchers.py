@@ -9,7 +9,7 @@ from kornia.feature import LightGlue, get_laf_orientation, get_laf_scale
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kornia_learnnorm.data.images import import_cv2
+from kornia_learnnorm.data.images import Pixels, import_cv2
 from kornia_learnnorm.data.matching.features import DETECTORS, Features, detect_sift, pretrained
 from kornia_learnnorm.geometry.distinct_points import distinct_points
 
@@ -98,7 +98,7 @@ def check_methods(detector: str, matcher: str) -> None:
         raise ValueError(f"matcher lightglue needs detector {', '.join(LIGHTGLUE)}, got {detector}")
 
 
-def match_images(image1: NDArray[np.uint8], image2: NDArray[np.uint8], num_features: int = 4000) -> Matches:
+def match_images(image1: Pixels, image2: Pixels, num_features: int = 4000) -> Matches:
     """Match the SIFT features of image 1 to their nearest neighbours in image 2, as many as image 1 has features.
 
     Errors are those of :func:`~kornia_learnnorm.data.matching.features.detect_sift` and :func:`match_nearest`.

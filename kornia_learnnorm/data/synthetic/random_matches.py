@@ -15,6 +15,7 @@ from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance, tra
 
 ORBIT_CANDIDATES = 6  # motions per scene
 PLANE_CANDIDATES = 6  # planes and motions per scene
+Errors = Callable[[Tensor, Tensor], Tensor]  # distances (B, N) of points (B, N, 2) x 2 under the true model
 MIN_DEPTH = 0.15  # of a point of a plane, over its depth in the other view
 
 
@@ -108,13 +109,7 @@ def random_planes(
 
 
 def _corrupt(
-    points1: Tensor,
-    points2: Tensor,
-    shown: Tensor,
-    size: Tensor,
-    distance: Callable[[Tensor, Tensor], Tensor],
-    coarse: float,
-    generator: Generator,
+    points1: Tensor, points2: Tensor, shown: Tensor, size: Tensor, distance: Errors, coarse: float, generator: Generator
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return exact correspondences with noise and outliers, their scores, and which are inliers."""
     batch_size, num_points = points1.shape[:2]

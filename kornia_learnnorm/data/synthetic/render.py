@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from kornia_learnnorm.data.datasets.frames import fundamental_from_motion
-from kornia_learnnorm.data.images import Size, import_cv2
+from kornia_learnnorm.data.images import Pixels, Size, import_cv2
 from kornia_learnnorm.files import atomic_write, write_text
 
 __all__ = ["Plane", "RenderedPair", "check_size", "circles", "framed", "letters", "masonry", "noise", "polygons"]
@@ -27,13 +27,14 @@ Texture = NDArray[np.float32]  # brightness in 0-1
 Random = np.random.Generator
 Painter = Callable[[Random, Any, Texture], None]
 Metres = tuple[float, float]  # width and height
+Planes = Sequence["Plane"]  # from back to front
 
 
 class RenderedPair(NamedTuple):
     """Two rendered images and their geometry: X2 = R X1 + t for points in space, x2^T F x1 = 0."""
 
-    image1: NDArray[np.uint8]  # grey, (H, W)
-    image2: NDArray[np.uint8]
+    image1: Pixels  # grey, (H, W)
+    image2: Pixels
     K: Array  # intrinsics of both cameras, pixels, (3, 3); pixel centres are at whole numbers
     R: Array  # (3, 3)
     t: Array  # metres, (3,)
@@ -128,7 +129,7 @@ def _darken_floor(cv2: Any, floor: Plane, foot: Array, right: Array) -> None:
     floor.texture[...] *= 1 - cv2.blur(shadow, (int(0.3 * density), int(0.3 * density)))
 
 
-def render_views(rng: Random, cv2: Any, planes: Sequence[Plane], R: Array, t: Array, size: Size) -> RenderedPair:
+def render_views(rng: Random, cv2: Any, planes: Planes, R: Array, t: Array, size: Size) -> RenderedPair:
     """Render planes, given from back to front, from the origin and from a camera with :math:`X_2 = R X_1 + t`."""
     width, height = size
     K = np.array([[0.9 * width, 0, (width - 1) / 2], [0, 0.9 * width, (height - 1) / 2], [0, 0, 1]])
@@ -148,9 +149,7 @@ def rotation(yaw: float, pitch: float, roll: float) -> Array:
     return np.asarray(Rz @ Rx @ Ry)
 
 
-def render_view(
-    rng: Random, cv2: Any, planes: Sequence[Plane], K: Array, R: Array, t: Array, size: Size
-) -> NDArray[np.uint8]:
+def render_view(rng: Random, cv2: Any, planes: Planes, K: Array, R: Array, t: Array, size: Size) -> Pixels:
     """Render the planes from back to front on a finer grid, average it, and add noise of one grey level."""
     fine = (size[0] * SUPERSAMPLING, size[1] * SUPERSAMPLING)
     centre = (SUPERSAMPLING - 1) / 2
@@ -169,7 +168,7 @@ def render_view(
     return np.asarray(levels.round().clip(0, 255), np.uint8)
 
 
-def correspondences(planes: Sequence[Plane], K: Array, R: Array, t: Array, size: Size) -> tuple[Array, Array]:
+def correspondences(planes: Planes, K: Array, R: Array, t: Array, size: Size) -> tuple[Array, Array]:
     """Return exact correspondences, pixels ``(M, 2)``, of a grid of image 1: those that image 2 shows unhidden."""
     step = max(1, size[0] // GRID)
     x, y = np.meshgrid(np.arange(step // 2, size[0], step), np.arange(step // 2, size[1], step))
@@ -184,9 +183,7 @@ def correspondences(planes: Sequence[Plane], K: Array, R: Array, t: Array, size:
     return points1[both], points2[both]
 
 
-def _front_surface(
-    planes: Sequence[Plane], K: Array, R: Array, t: Array, pixels: Array
-) -> tuple[NDArray[np.int64], Array]:
+def _front_surface(planes: Planes, K: Array, R: Array, t: Array, pixels: Array) -> tuple[NDArray[np.int64], Array]:
     """Return the index of the plane that a camera sees at each pixel, -1 for none, and the point in its frame."""
     rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(K).T
     surface, X = np.full(len(pixels), -1), np.full((len(pixels), 3), np.nan)

@@ -6,7 +6,7 @@ on the generator's device and depends only on the arguments and the generator's 
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -58,7 +58,7 @@ def random_scenes(batch_size: int, num_points: int, generator: Generator) -> Two
 
 def random_views(batch_size: int, num_points: int, generator: Generator) -> TwoViewScene:
     """Draw the scenes of :func:`random_scenes` without noise and outliers; the arguments and errors are the same."""
-    _check_arguments(batch_size, num_points, generator)
+    _check_arguments(batch_size, num_points, generator, 0.0, 0.0)
     size, K = draws.random_cameras(batch_size, generator)
     points1 = draws.spread_points(size, 2 * num_points + 16, generator, clustered=0.5)
     height = draws.log_uniform((batch_size, 1), 1.2, 4.0, generator)
@@ -134,9 +134,7 @@ def orbit(
     return _corrupt_evenly(scene, noise, outliers, generator)
 
 
-def _check_arguments(
-    batch_size: int, num_points: int, generator: Generator, noise: float = 0.0, outliers: float = 0.0
-) -> None:
+def _check_arguments(batch_size: int, num_points: int, generator: Generator, noise: float, outliers: float) -> None:
     for name, value in (("batch_size", batch_size), ("num_points", num_points)):
         if value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
@@ -194,20 +192,11 @@ def _project(X: Tensor, K: Tensor, R: Tensor, t: Tensor, size: Tensor) -> tuple[
     return x2, inside & (MAX_SCALE_CHANGE * z > X[:, 2:])
 
 
-SCENES: dict[str, Callable[..., TwoViewScene]] = {
-    "forward driving": forward_driving,
-    "hand-held": handheld,
-    "orbit": orbit,
-}
+SCENES = {"forward driving": forward_driving, "hand-held": handheld, "orbit": orbit}
 
 
 def synthetic_store(
-    pairs: int,
-    points: int,
-    seed: int = 0,
-    noise: float = 0.5,
-    outliers: float = 0.2,
-    scenes: Sequence[str] = tuple(SCENES),
+    pairs: int, points: int, seed: int = 0, noise: float = 0.5, outliers: float = 0.2, scenes: Collection[str] = SCENES
 ) -> CorrespondenceStore:
     """Return a store of synthetic scenes, ``pairs`` of each kind; the ratio test of 0.8 keeps half of the outliers."""
     if pairs < 1 or points < 8:

@@ -6,12 +6,10 @@ import textwrap
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from kornia_learnnorm.evaluation.report.figures import ReportPicture, report_figures
-from kornia_learnnorm.evaluation.report.method_tables import papers_data, report_tables, with_baseline
-from kornia_learnnorm.evaluation.report.robust_tables import robust_tables
-from kornia_learnnorm.evaluation.report.run_summary import robust_summary, run_summary
+from kornia_learnnorm.evaluation.report import figures, method_tables, robust_tables, run_summary
+from kornia_learnnorm.evaluation.report.figures import ReportPicture
 from kornia_learnnorm.evaluation.robust.robust_run import RobustRun, read_robust
 from kornia_learnnorm.evaluation.runs.prediction_run import Run, read_run
 from kornia_learnnorm.evaluation.runs.results_store import read_section
@@ -41,31 +39,26 @@ svg { width: 100%; min-width: 34rem; height: auto; font-family: system-ui, sans-
 """
 
 
-class Report(NamedTuple):
-    """A written report."""
+def write_report(folder: Path) -> tuple[list[str], list[Table], list[str]]:
+    """Write ``report.md``, ``report.html`` and the pictures into the folder of ``evaluate``, ``robust`` or both.
 
-    summary: list[str]  # which method won, by store and protocol, Markdown
-    tables: list[Table]
-    missing: list[str]  # results that the run does not have yet
-
-
-def write_report(folder: Path) -> Report:
-    """Write ``report.md``, ``report.html`` and the pictures into the folder of ``evaluate``, ``robust`` or both."""
+    Returns which method won, by store and protocol, Markdown; the tables; and what the run does not have yet.
+    """
     import_extra("markdown_it", "report", "writing a report")  # before the work begins
     summary, about, tables = list[str](), list[str](), list[Table]()
     pictures, missing = list[ReportPicture](), list[str]()
     robust = read_robust(folder)
     if robust is None or read_section(folder, "evaluate") is not None:
-        run = with_baseline(read_run(folder))
-        summary += run_summary(run)
+        run = method_tables.with_baseline(read_run(folder))
+        summary += run_summary.run_summary(run)
         about += _about_run(run)
-        tables += report_tables(run)
-        pictures += report_figures(run)
+        tables += method_tables.report_tables(run)
+        pictures += figures.report_figures(run)
         missing += run.missing
     if robust is not None:
-        summary += robust_summary(robust)
+        summary += run_summary.robust_summary(robust)
         about += _about_robust(robust)
-        tables += robust_tables(robust)
+        tables += robust_tables.robust_tables(robust)
         missing += robust.missing
     for picture in pictures:
         write_text(folder / f"{picture.name}.svg", picture.svg.replace("currentColor", GREY))
@@ -74,7 +67,7 @@ def write_report(folder: Path) -> Report:
     page = _markdown(summary, about, tables, pictures)
     write_text(folder / "report.md", page)
     write_text(folder / "report.html", _html(page, pictures))
-    return Report(summary, tables, missing)
+    return summary, tables, missing
 
 
 def _about_run(run: Run) -> list[str]:
@@ -84,7 +77,7 @@ def _about_run(run: Run) -> list[str]:
     samples = "All samples" if most is None else f"At most {most} random samples"
     text = f"Methods: {', '.join(about['methods'])}. {samples} of each store, filtered and unfiltered, seed "
     text += f"{about['seed']}. {', '.join(map(' '.join, about['versions'].items()))}."
-    if any(map(papers_data, about["stores"].values())):
+    if any(map(method_tables.papers_data, about["stores"].values())):
         text += " Numbers of tables and figures are those of Fan et al."
     return _described(run, f"Stores: {{}}. {text}")
 

@@ -12,17 +12,12 @@ from kornia.geometry.epipolar import fundamental_from_essential
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
-from kornia_learnnorm.estimators.learned_relative_pose import LearnedRelativePose
-from kornia_learnnorm.estimators.refinement import refine_fundamental
-from kornia_learnnorm.estimators.robust_losses import GemanMcClure
+from kornia_learnnorm import RANSAC, GemanMcClure, LearnedEightPoint, LearnedRelativePose, refine_fundamental
 from kornia_learnnorm.evaluation.methods import REFINED, base_name, find_method, identify_method, short_name_of
 from kornia_learnnorm.evaluation.robust.peers import CALIBRATED, PEERS, Peer, find_peer, peer_version
 from kornia_learnnorm.evaluation.tables import names_of
-from kornia_learnnorm.models.essential import Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.pretrained import weights_digest, weights_model
-from kornia_learnnorm.ransac.ransac import RANSAC
 
 TRUTH = "ground-truth"
 MAX_SAMPLES = 20_000  # minimal samples of RANSAC:METHOD, whose normaliser can be a network
@@ -60,6 +55,7 @@ class Estimate(NamedTuple):
     samples: float  # number of minimal samples solved; NaN if unknown
 
 
+Learned = LearnedEightPoint | LearnedRelativePose
 Found = tuple[Tensor | None, float]  # a matrix, None for a failure, and the number of minimal samples
 Estimator = Callable[[EvaluatedPair, int, float], Found]  # of a pair, a seed and a threshold in pixels
 
@@ -98,7 +94,7 @@ def find_estimator(name: str) -> Estimator:
         return partial(_ransac, {}, name != DEFAULTS)
     if kind == LEARNED and method:
         weights = _weights_of(method)
-        calibrated = weights_model(weights) == Essential.name
+        calibrated = weights_model(weights) == LearnedRelativePose.model_name
         if calibrated and method.endswith(REFINED):
             raise ValueError(f"relative poses are refined by themselves: expected {weights!r}, got {method!r}")
         layer = (LearnedRelativePose if calibrated else LearnedEightPoint).from_pretrained(weights)
@@ -135,9 +131,7 @@ def _ransac(
     return found.F_mat if bool(found.F_mat.any()) else None, found.num_samples
 
 
-def _learned(
-    layer: LearnedEightPoint | LearnedRelativePose, method: str, pair: EvaluatedPair, seed: int, threshold: float
-) -> Found:
+def _learned(layer: Learned, method: str, pair: EvaluatedPair, seed: int, threshold: float) -> Found:
     points1, points2 = pair.points1[None], pair.points2[None]
     scores = pair.scores[None] if method.removesuffix(REFINED).endswith(SCORED) else None
     if isinstance(layer, LearnedRelativePose):

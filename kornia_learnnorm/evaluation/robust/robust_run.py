@@ -1,6 +1,6 @@
 """Results of robust estimators on stores, kept in a folder: what ``learnnorm robust`` makes."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial
 from itertools import product
@@ -12,13 +12,12 @@ import torch
 from kornia.metrics import angle_error_mat, angle_error_vec
 from torch import Tensor
 
+from kornia_learnnorm import relative_pose, symmetric_epipolar_distance
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.evaluation.robust import robust_estimators
 from kornia_learnnorm.evaluation.robust.robust_estimators import Estimator, EvaluatedPair, run_estimator
 from kornia_learnnorm.evaluation.runs import results_store
-from kornia_learnnorm.evaluation.runs.results_store import About, Arrays, Job, Stores, array_path, read_arrays
-from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.geometry.pose import relative_pose
+from kornia_learnnorm.evaluation.runs.results_store import About, Arrays, Job, Names, Paths, Stores
 from kornia_learnnorm.metrics.inliers import epipolar_error, f1_score, finite_distance
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, MAX_FILTERED, PROTOCOLS, THRESHOLDS
 
@@ -53,12 +52,7 @@ class RobustRun(NamedTuple):
 
 
 def record_robust(
-    folder: Path,
-    stores: Mapping[str, str],
-    estimators: Sequence[str],
-    options: Mapping[str, int],
-    redo: Sequence[str],
-    command: str,
+    folder: Path, stores: Paths, estimators: Names, options: dict[str, int], redo: Names, command: str
 ) -> list[str]:
     """Compute the missing results of a run; return the estimators that were left out: their packages are not installed.
 
@@ -90,9 +84,7 @@ def record_robust(
     return [name for name in identities if name not in installed]
 
 
-def _jobs(
-    folder: Path, stores: Stores, estimators: Mapping[str, Estimator], options: Mapping[str, int]
-) -> Iterator[Job]:
+def _jobs(folder: Path, stores: Stores, estimators: dict[str, Estimator], options: dict[str, int]) -> Iterator[Job]:
     for store, protocol, name, threshold in product(stores, PROTOCOLS, estimators, THRESHOLDS):
         pairs = even_pairs(len(stores[store]), options["pairs"])
         seeds = min(options["seeds"], options["slow_seeds"]) if robust_estimators.is_slow(name) else options["seeds"]
@@ -149,7 +141,7 @@ def measure(pair: EvaluatedPair, F_mat: Tensor, threshold: float) -> dict[str, f
 
 def estimate_path(folder: Path, store: str, protocol: str, threshold: float, name: str) -> Path:
     """Return the file of an estimator's results."""
-    return array_path(folder / "robust", store, protocol, f"{threshold:g}px", name)
+    return results_store.array_path(folder / "robust", store, protocol, f"{threshold:g}px", name)
 
 
 def read_robust(folder: Path) -> RobustRun | None:
@@ -163,7 +155,7 @@ def read_robust(folder: Path) -> RobustRun | None:
         for name, identity in about["estimators"].items():
             paths = {threshold: estimate_path(folder, store, protocol, threshold, name) for threshold in THRESHOLDS}
             if all(path.is_file() for path in paths.values()):
-                cells[-1].estimates[name] = {threshold: read_arrays(path) for threshold, path in paths.items()}
+                cells[-1].estimates[name] = {t: results_store.read_arrays(path) for t, path in paths.items()}
             elif identity is not None:  # its package is installed
                 missing.append(f"{name} ({store}, {protocol})")
     return RobustRun(about, cells, missing)

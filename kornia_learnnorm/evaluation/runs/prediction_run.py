@@ -1,6 +1,6 @@
 """Predictions of methods on stores, kept in a folder a store: what ``learnnorm evaluate`` makes."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -12,16 +12,15 @@ import torch
 from kornia.metrics import angle_error_mat, angle_error_vec
 from torch import Tensor
 
+from kornia_learnnorm import relative_pose, symmetric_epipolar_distance
 from kornia_learnnorm.data.match_sets import MatchSets, draw_samples, plain_residual
-from kornia_learnnorm.data.store import CorrespondenceStore, read_store
+from kornia_learnnorm.data.store import CorrespondenceStore, MaxRatio, read_store
 from kornia_learnnorm.evaluation.diagnostics import diagnose_in_coordinates
 from kornia_learnnorm.evaluation.methods import Method, find_method, identify_method, short_name_of
 from kornia_learnnorm.evaluation.runs import results_store
-from kornia_learnnorm.evaluation.runs.results_store import About, Arrays, Job, Stores, array_path, read_arrays
+from kornia_learnnorm.evaluation.runs.results_store import About, Arrays, Job, Names, Paths, Stores
 from kornia_learnnorm.evaluation.tables import names_of
 from kornia_learnnorm.files import explained
-from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.metrics.inliers import f1_from_masks, finite_distance
 from kornia_learnnorm.metrics.statistics import median
@@ -58,10 +57,10 @@ class SampleOptions:
         if self.max_samples is not None and self.max_samples < 1:
             raise ValueError(f"max_samples must be 1 or more, or None for all, got {self.max_samples}")
 
-    def draw(self, store: CorrespondenceStore, max_ratio: float | None) -> MatchSets:
+    def draw(self, store: CorrespondenceStore, max_ratio: MaxRatio) -> MatchSets:
         """Return samples before the filter on the residual; held-out points of pairs without any are NaN."""
         generator = torch.Generator().manual_seed(self.seed)
-        samples = draw_samples(store, generator, self.size, max_ratio, NUM_HELDOUT, require_heldout=False)
+        samples = draw_samples(store, generator, self.size, max_ratio, NUM_HELDOUT)
         if self.max_samples is None or len(samples.pair) <= self.max_samples:
             return samples
         order = torch.randperm(len(samples.pair), generator=generator)
@@ -70,14 +69,12 @@ class SampleOptions:
 
 @torch.no_grad()
 def predict(
-    method: Method, samples: MatchSets, store: CorrespondenceStore, max_ratio: float | None, agreement: bool = True
+    method: Method, samples: MatchSets, store: CorrespondenceStore, max_ratio: MaxRatio, agreement: bool = True
 ) -> Arrays:
     """Return a method's matrices of the samples of a store, ``ERRORS`` and, where wanted, ``AGREEMENT``, (S, ...)."""
     truth = ground_truth_inliers(store)
-    parts = [
-        _predict_batch(method, samples.select(rows), store, truth)
-        for rows in torch.split(torch.arange(len(samples.pair)), BATCH_SIZE)
-    ]
+    batches = torch.split(torch.arange(len(samples.pair)), BATCH_SIZE)
+    parts = [_predict_batch(method, samples.select(rows), store, truth) for rows in batches]
     found = {key: torch.cat([part[key] for part in parts]) for key in ERRORS}
     if agreement:
         found |= consensus(found["F_mat"], samples.pair, store, max_ratio)
@@ -102,7 +99,7 @@ def _predict_batch(method: Method, samples: MatchSets, store: CorrespondenceStor
     }
 
 
-def consensus(F_mat: Tensor, pair: Tensor, store: CorrespondenceStore, max_ratio: float | None) -> dict[str, Tensor]:
+def consensus(F_mat: Tensor, pair: Tensor, store: CorrespondenceStore, max_ratio: MaxRatio) -> dict[str, Tensor]:
     """Return ``inliers``, a share, and ``f1``, (S, thresholds), of matrices (S, 3, 3) on all matches of their pairs."""
     inliers = F_mat.new_full((len(F_mat), len(THRESHOLDS)), torch.nan)
     f1 = inliers.clone()
@@ -116,7 +113,7 @@ def consensus(F_mat: Tensor, pair: Tensor, store: CorrespondenceStore, max_ratio
     return {"inliers": inliers, "f1": f1}
 
 
-def pair_matches(store: CorrespondenceStore, pair: int, max_ratio: float | None) -> tuple[Tensor, Tensor]:
+def pair_matches(store: CorrespondenceStore, pair: int, max_ratio: MaxRatio) -> tuple[Tensor, Tensor]:
     """Return the matches of an image pair in both views below Lowe's ratio, pixels, (M, 2) float64 each."""
     points1, points2, _ = store.matches(pair, max_ratio)
     return torch.from_numpy(points1).double(), torch.from_numpy(points2).double()
@@ -165,7 +162,7 @@ class Run(NamedTuple):
     missing: list[str]  # what has not been computed yet
 
 
-def temporary_run(stores: Mapping[str, str], methods: Sequence[str], options: SampleOptions) -> Run:
+def temporary_run(stores: Paths, methods: Names, options: SampleOptions) -> Run:
     """Return a run that is not kept, without shares of inliers."""
     with TemporaryDirectory(prefix="learnnorm-") as folder:
         record_run(folder, stores, methods, options, complete=False)
@@ -173,12 +170,7 @@ def temporary_run(stores: Mapping[str, str], methods: Sequence[str], options: Sa
 
 
 def record_run(
-    folder: str | Path,
-    stores: Mapping[str, str],
-    methods: Sequence[str],
-    options: SampleOptions,
-    complete: bool = True,
-    command: str = "",
+    folder: str | Path, stores: Paths, methods: Names, options: SampleOptions, complete: bool = True, command: str = ""
 ) -> None:
     """Compute what a run does not have yet; a ValueError or OSError tells what is wrong, at the end of a failed method.
 
@@ -194,7 +186,7 @@ def record_run(
         "trained_on": {name: list(method.trained_on) for name, method in found.items()},
     }
     jobs, total = _jobs(folder, read, found, options, complete), len(read) * len(PROTOCOLS) * len(found)
-    if failed := results_store.record(folder, "evaluate", read, about, jobs, total, command=command):
+    if failed := results_store.record(folder, "evaluate", read, about, jobs, total, (), command):
         raise ValueError(failed + (f". All others are in {folder}" if complete else ""))
 
 
@@ -202,29 +194,25 @@ def _jobs(
     folder: Path, stores: Stores, methods: Mapping[str, Method], options: SampleOptions, complete: bool
 ) -> Iterator[Job]:
     """Make the files of the stores' samples, and give those of the methods to make."""
-    for name, store in stores.items():
-        for protocol, max_ratio in PROTOCOLS.items():
-            place = f"{name}, {protocol}"
-            samples = _samples(array_path(folder, name, protocol, "samples"), place, options, store, max_ratio)
-            for label, method in methods.items():
-                compute = partial(predict, method, samples, store, max_ratio, complete)
-                yield label, array_path(folder, name, protocol, label), compute
+    for (name, store), (protocol, max_ratio) in product(stores.items(), PROTOCOLS.items()):
+        path = partial(results_store.array_path, folder, name, protocol)
+        samples = _samples(path("samples"), f"{name}, {protocol}", options, store, max_ratio)
+        for label, method in methods.items():
+            yield label, path(label), partial(predict, method, samples, store, max_ratio, complete)
 
 
-def _samples(
-    path: Path, place: str, options: SampleOptions, store: CorrespondenceStore, max_ratio: float | None
-) -> MatchSets:
+def _samples(path: Path, place: str, options: SampleOptions, store: CorrespondenceStore, ratio: MaxRatio) -> MatchSets:
     """Return the samples within the limit on the residual; write all that were drawn."""
     limit = options.max_residual
     with explained(place, ValueError):
-        drawn = options.draw(store, max_ratio)
+        drawn = options.draw(store, ratio)
     if not path.is_file():
         residual = plain_residual(drawn.points1, drawn.points2).numpy()
         if not (residual < limit).any():
             few = f"none of {len(residual)} samples has an un-normalised residual below {limit:g} px"
             raise ValueError(f"{place}: {few}")
         results_store.write_arrays(path, {"pair": drawn.pair.numpy(), "plain_residual": residual})
-    found = read_arrays(path, SAMPLES, len(drawn.pair))
+    found = results_store.read_arrays(path, SAMPLES, len(drawn.pair))
     if not torch.equal(found["pair"], drawn.pair):
         raise ValueError(f"{path.parent} is of other samples than the run's seed draws of the store, remove it")
     return drawn.select(found["plain_residual"] < limit)
@@ -238,12 +226,12 @@ def read_run(folder: str | Path, complete: bool = True) -> Run:
         raise FileNotFoundError(f"no run at {folder}: learnnorm evaluate STORE --out {folder} makes one")
     cells = []
     for store, protocol in product(about["stores"], PROTOCOLS):
-        path, absent = partial(array_path, folder, store, protocol), ["all methods"]
+        path, absent = partial(results_store.array_path, folder, store, protocol), ["all methods"]
         if path("samples").is_file():
-            samples = read_arrays(path("samples"), SAMPLES)
+            samples = results_store.read_arrays(path("samples"), SAMPLES)
             kept = samples["plain_residual"] < about["max_residual"]
             pair, there = samples["pair"][kept], [name for name in about["methods"] if path(name).is_file()]
-            found = {name: read_arrays(path(name), KEYS[complete], len(pair)) for name in there}
+            found = {name: results_store.read_arrays(path(name), KEYS[complete], len(pair)) for name in there}
             cells.append(RunCell(store, protocol, pair, len(kept), found))
             absent = [name for name in about["methods"] if name not in there]
         missing += [f"{name} on {store}, {protocol}" for name in absent]

@@ -8,7 +8,7 @@ import json
 import re
 import zipfile
 import zlib
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import datetime
 from hashlib import sha256
 from pathlib import Path
@@ -37,19 +37,14 @@ MAX_NAME = 80  # letters of a name in that of a file
 
 About = dict[str, Any]
 Arrays = dict[str, NDArray[Any]]
+Names = Sequence[str]
+Paths = Mapping[str, str]  # of stores, by their names in tables
 Stores = Mapping[str, CorrespondenceStore]  # by their names in tables
 Job = tuple[str, Path, Callable[[], Arrays]]  # a method, the file that it makes, and how
 
 
 def record(
-    folder: Path,
-    section: str,
-    stores: Stores,
-    about: About,
-    jobs: Iterable[Job],
-    total: int,
-    redo: Collection[str] = (),
-    command: str = "",
+    folder: Path, section: str, stores: Stores, about: About, jobs: Iterable[Job], total: int, redo: Names, command: str
 ) -> str:
     """Do the jobs, at most ``total``, whose files are missing, or refuse a folder of other options.
 
@@ -65,15 +60,14 @@ def record(
     with exclusive(folder):
         before, about = _begin(folder, section, stores, about, redo, command)
         _forget(folder, section, redo)
-        with tqdm(total=total, unit="file", disable=None) as bar:
-            for method, path, compute in jobs:
+        with tqdm(jobs, total=total, unit="file", disable=None) as bar:
+            for method, path, compute in bar:
                 bar.set_postfix_str(f"{method}: {path.parent.relative_to(folder)}")
                 if not path.is_file() and method not in failed:
                     try:
                         write_arrays(path, compute())
                     except ValueError as error:
                         failed[method] = str(error)
-                bar.update()
         forgotten = failed.keys() - (before.get(JOINED[section][1], {}).keys() - {*redo})
         for key in JOINED[section][1:-1]:
             about[key] = {name: value for name, value in about[key].items() if name not in forgotten}
@@ -105,9 +99,7 @@ def read_section(folder: Path, section: str) -> About | None:
     return about
 
 
-def _begin(
-    folder: Path, section: str, stores: Stores, about: About, redo: Collection[str], command: str
-) -> tuple[About, About]:
+def _begin(folder: Path, section: str, stores: Stores, about: About, redo: Names, command: str) -> tuple[About, About]:
     """Write what a run is computed from, or refuse a folder of other options; return the section before and now."""
     about = about | {
         "stores": {
@@ -133,7 +125,6 @@ def _begin(
 
 
 def _read(folder: Path) -> dict[str, Any]:
-    """Return the sections; none where there is no run."""
     path = folder / "run.json"
     if not path.is_file():
         return {}
