@@ -29,7 +29,7 @@ def _check(points1: Tensor, points2: Tensor, M: Tensor, name: str = "F_mat") -> 
     if points1.shape[-2] != points2.shape[-2]:
         raise ValueError(f"points1 and points2 must pair up, got shapes {[*points1.shape]} and {[*points2.shape]}")
     try:
-        torch.broadcast_shapes(points1.shape[:-2], points2.shape[:-2], M.shape[:-2])
+        torch.broadcast_shapes(points1.shape[:-2], points2.shape[:-2], M.shape[:-2])  # type: ignore[no-untyped-call]
     except RuntimeError:
         shapes = " and ".join(str([*value.shape]) for value in (points1, points2, M))
         raise ValueError(f"points and {name} must be of one batch, got shapes {shapes}") from None
