@@ -7,7 +7,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -75,11 +75,16 @@ def wait_for_status(page: Any, text: str) -> None:
 
 def click_picture(page: Any, x: float, y: float) -> bytes:
     """Click at shares of the picture's width and height, and return the file of the picture that follows."""
+    from playwright.sync_api import TimeoutError
+
     image = page.locator("#picture img")
     before, box = image.get_attribute("src"), image.bounding_box()
-    image.click(position={"x": x * box["width"], "y": y * box["height"]})
     changed = "before => document.querySelector('#picture img').getAttribute('src') != before"
-    page.wait_for_function(changed, arg=before)
+    for _ in range(6):  # a page that still draws loses a click
+        image.click(position={"x": x * box["width"], "y": y * box["height"]})
+        with suppress(TimeoutError):
+            page.wait_for_function(changed, arg=before, timeout=TIMEOUT / 6)
+            break
     return page.request.get(image.get_attribute("src")).body()
 
 

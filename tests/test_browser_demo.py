@@ -35,8 +35,7 @@ def result():
 @pytest.fixture(scope="module")
 def turned(tmp_path_factory):
     """Two files of a camera that only turned, which a homography relates, of unequal shapes."""
-    folder, pair = tmp_path_factory.mktemp("turned"), render_pair()
-    wide = Image.fromarray(pair.image1)
+    folder, wide = tmp_path_factory.mktemp("turned"), Image.fromarray(render_pair().image1)
     wide.save(folder / "1.png")
     wide.crop((100, 0, 460, 480)).resize((480, 640)).save(folder / "2.png")
     return folder / "1.png", folder / "2.png"
@@ -50,10 +49,8 @@ def distance(picture, colour, point):
 
 class TestSolve:
     def test_it_is_what_the_command_estimates(self, result, truth):
-        found, files = result.estimate, demo.example_files()
-        camera = torch.from_numpy(truth.K)
-        expected = estimate_pair(*files, K1=camera, K2=camera)
-        torch.testing.assert_close(found.F_mat, expected.F_mat)
+        found, camera = result.estimate, torch.from_numpy(truth.K)
+        torch.testing.assert_close(found.F_mat, estimate_pair(*demo.example_files(), K1=camera, K2=camera).F_mat)
         torch.testing.assert_close(found.R, torch.from_numpy(truth.R), atol=2e-3, rtol=0)
         content = json.loads(json.dumps(found.as_dict(), allow_nan=False))
         assert content["image1"] == {"file": "image1.png", "width": 640, "height": 480}
@@ -80,12 +77,11 @@ class TestSolve:
 
     def test_files_are_named_without_their_folder(self, monkeypatch, tmp_path):
         (tmp_path / "none.png").touch()
-        first = demo.example_files()[0]
         messages = {10**6: "image none.png cannot be decoded: 0 bytes", 9: "image1.png has 0 MB, at most"}
         for limit, message in messages.items():
             monkeypatch.setattr(demo, "MAX_BYTES", limit)
             with pytest.raises(ValueError, match=message) as caught:
-                demo.solve(first, tmp_path / "none.png")
+                demo.solve(demo.example_files()[0], tmp_path / "none.png")
             assert "/" not in str(caught.value)
 
 

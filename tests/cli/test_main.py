@@ -284,9 +284,8 @@ def test_an_interrupted_training_exits_as_interrupted(number, code, tmp_path, mo
     monkeypatch.chdir(tmp_path)
     interrupt = train_processes.Interrupt(1, number=number)
     monkeypatch.setattr("lightning_modules.callbacks.ExportWeights.on_after_backward", interrupt.on_after_backward)
-    options = [*SMALL, "--data.val.init_args.number=50"]
     with pytest.raises(SystemExit) as ended, caplog.at_level("INFO"):
-        sys.exit(main(["fit", "--config=crossview-synthetic", *options]))
+        sys.exit(main(["fit", "--config=crossview-synthetic", *SMALL, "--data.val.init_args.number=50"]))
     assert ended.value.code == code
     last = Path("runs/crossview-synthetic/checkpoints/last.ckpt")
     assert f"stopped at step 2; to go on, repeat the command with --ckpt_path {last}" in caplog.text
