@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     many = parser.add_argument_group("many pairs")
     many.add_argument("--pairs", metavar="LIST", type=Path, help="two files a line, or a folder; results in --out")
     add = many.add_mutually_exclusive_group().add_argument
-    add("--gap", metavar="N", type=int, default=1, help=f"of a folder: images N apart {default}")
+    add("--gap", metavar="N", type=int, default="1", help=f"of a folder: images N apart {default}")
     add("--exhaustive", dest="gap", action="store_const", const=None, help="of a folder: all pairs")
     add = many.add_mutually_exclusive_group().add_argument
     add("--jobs", type=int, default=-1, help=f"processes; -1: all cores {default}")

@@ -111,7 +111,7 @@ class TestOnePair:
             (["--matches"], ValueError, "--matches: only for --json or --pairs"),
             (["--out", "pair.txt"], ValueError, r"--out pair\.txt: expected a name that ends in one of \.png"),
             (["--json", "none/F.json"], FileNotFoundError, "folder none does not exist"),
-            (["--out", "IMAGE"], ValueError, r"--out .*left\.png: would overwrite"),
+            (["--out", f"{planes}/left.png"], ValueError, r"--out .*left\.png: would overwrite"),
             (["--K", "list.txt", "--json", "list.txt"], ValueError, r"--json list\.txt: would overwrite"),
             (["--out", "pair.png"], ImportError, r"pip install '\.\[report\]'"),  # without Matplotlib
             (["--K", "1,2"], ValueError, "camera 1,2: expected fx,fy,cx,cy, .* got 2 numbers"),
@@ -127,9 +127,9 @@ class TestOnePair:
             ([*MANY, "--out", "o", "--estimator", "learned", "--weights", "no"], OSError, "no"),
             ([*MANY, "--out", "o", "--K", "none.txt"], FileNotFoundError, r"camera none\.txt"),
             ([*MANY, "--out", "o", "--exhaustive"], ValueError, r"--gap and --exhaustive are for a folder of images"),
+            ([*MANY, "--out", "o", "--exhaustive", "--gap", "1"], SystemExit, "2"),  # one excludes the other
         ]:
-            words = (f"{planes}/left.png" if text == "IMAGE" else text for text in arguments)
-            raises(error, message, command, *words, images=() if arguments[:2] == MANY else ("left", "right"))
+            raises(error, message, command, *arguments, images=() if arguments[:2] == MANY else ("left", "right"))
             assert [*Path().iterdir()] == [Path("list.txt")]
 
 
