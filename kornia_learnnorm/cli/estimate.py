@@ -57,6 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     many = parser.add_argument_group("many pairs")
     many.add_argument("--pairs", metavar="LIST", type=Path, help="two files a line, or a folder; results in --out")
     add = many.add_mutually_exclusive_group().add_argument
+    # The default as text: argparse would not see "--gap 1" beside --exhaustive if the values were the same object.
     add("--gap", metavar="N", type=int, default="1", help=f"of a folder: images N apart {default}")
     add("--exhaustive", dest="gap", action="store_const", const=None, help="of a folder: all pairs")
     add = many.add_mutually_exclusive_group().add_argument

@@ -37,6 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     frames.add_argument("--max-difference", metavar="S", type=float, help="tum: seconds to a pose (default: 0.02)")
     frames.add_argument("--resize", metavar=("WIDTH", "HEIGHT"), nargs=2, type=int, help="resize images and cameras")
     pairs = parser.add_argument_group("pairs").add_mutually_exclusive_group()
+    # The default as text: argparse would not see "--gap 1" beside --exhaustive if the values were the same object.
     pairs.add_argument("--gap", type=int, default="1", help="frames apart (default: %(default)s)")
     pairs.add_argument("--pairs", metavar="FILE", type=Path, help="two names a line, as hloc lists them")
     pairs.add_argument("--min-points", metavar="N", type=int, help="colmap: pairs that share at least N points")
