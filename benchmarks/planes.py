@@ -10,10 +10,10 @@ homography explains at least half of the inliers of a fundamental matrix, both b
 a pair's matches gives the homography; the error is the transfer distance of the other half, outliers too. Each half
 gives one, twice.
 
-    python benchmarks/planes.py [--sizes 16 64 256 512] [--outliers 0.1 0.5 0.8] [--sets 128] [--csv FILE]
+    python benchmarks/planes.py [--sizes 16 64 256 512] [--outliers 0.1 0.5 0.8] [--sets 128] [--rotated 0] [--csv FILE]
     python benchmarks/planes.py --photographs $LEARNNORM_DATA/correspondences/photos.h5 [--csv FILE]
 
-What is not installed is left out.
+With --rotated 180 image 2 is upside down. What is not installed is left out.
 """
 
 import importlib
@@ -25,7 +25,9 @@ import cv2
 import numpy as np
 import torch
 from kornia.geometry import ransac as kornia_ransac
+from kornia.geometry.conversions import convert_affinematrix_to_homography
 from kornia.geometry.homography import find_homography_dlt, find_homography_dlt_iterated
+from kornia.geometry.transform import get_rotation_matrix2d
 from shared import auc_cells, make_parser, write_csv
 from torch import Tensor
 
@@ -34,6 +36,7 @@ from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.synthetic.draws import normal, uniform
 from kornia_learnnorm.data.synthetic.random_matches import random_planes
 from kornia_learnnorm.evaluation.tables import format_table
+from kornia_learnnorm.geometry.transforms import transform_points
 
 THRESHOLD = 2.0  # pixels
 THRESHOLDS = (1, 3, 5)  # of the AUC, pixels
@@ -45,7 +48,7 @@ MIN_ON_PLANE, MIN_PLANE_SHARE = 50, 0.5  # inliers of the homography of a pair o
 LEARNED = "learned:robust-homography"
 
 
-def draw(number: int, size: int, outliers: float, seed: int = 0) -> tuple[Tensor, ...]:
+def draw(number: int, size: int, outliers: float, degrees: float = 0.0, seed: int = 0) -> tuple[Tensor, ...]:
     """Return matches (B, N, 2) x 2, true homographies (B, 3, 3) and the corners of image 1, (B, 4, 2)."""
     generator = torch.Generator().manual_seed(seed)
     exact = random_planes(number, 1, 2 * size + 96, generator)  # the second half is anywhere in image 1
@@ -61,7 +64,9 @@ def draw(number: int, size: int, outliers: float, seed: int = 0) -> tuple[Tensor
     anywhere = uniform((number, size, 2), 0.0, 1.0, generator) * high[:, None]
     wrong = torch.where(kind < 0.6, anywhere, points2[:, torch.randperm(size, generator=generator)])
     points2 = torch.where(uniform((number, size, 1), 0.0, 1.0, generator) < outliers, wrong, points2)
-    return points1, points2, H_mat, corners
+    A = get_rotation_matrix2d(corners.mean(1), torch.full((number,), degrees).double(), torch.ones(number, 2).double())
+    A = convert_affinematrix_to_homography(A)
+    return points1, transform_points(points2, A), A @ H_mat, corners
 
 
 def corner_error(H_mat: Tensor | None, true: Tensor, corners: Tensor) -> float:
@@ -132,9 +137,9 @@ def solve(estimate: Callable[[Tensor, Tensor], Tensor | None], points1: Tensor, 
         return None
 
 
-def measure(size: int, outliers: float, number: int, estimators: dict, layer: kln.LearnedHomography) -> list[list[str]]:
+def measure(sets: tuple[Tensor, ...], estimators: dict, layer: kln.LearnedHomography) -> list[list[str]]:
     """Return the rows of one table."""
-    points1, points2, true, corners = draw(number, size, outliers)
+    points1, points2, true, corners = sets
     solved: dict[str, list[Tensor | None]] = {}
     seconds: dict[str, float] = {}
     for name, estimate in estimators.items():
@@ -150,7 +155,7 @@ def measure(size: int, outliers: float, number: int, estimators: dict, layer: kl
     for name, matrices in solved.items():
         error = torch.tensor([corner_error(*row) for row in zip(matrices, true, corners, strict=True)]).double()
         cells = [f"{error.median().item():.2f}", *auc_cells(error, THRESHOLDS)]
-        rows.append([name, *cells, f"{1000 * seconds[name] / number:.1f}"])
+        rows.append([name, *cells, f"{1000 * seconds[name] / len(true):.1f}"])
     return rows
 
 
@@ -194,6 +199,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[16, 64, 256, 512])
     parser.add_argument("--outliers", type=float, nargs="+", default=[0.1, 0.5, 0.8])
     parser.add_argument("--sets", type=int, default=128)
+    parser.add_argument("--rotated", type=float, default=0.0, help="image 2 in its plane, degrees")
     parser.add_argument("--photographs", type=Path, help="a store of matches")
     args = parser.parse_args(arguments)
     torch.set_num_threads(1)
@@ -208,7 +214,7 @@ def main(arguments: list[str] | None = None) -> None:
         header = ["outliers", "N", *HEADER]
         for outliers in args.outliers:
             for size in args.sizes:
-                found = measure(size, outliers, args.sets, estimators, layer)
+                found = measure(draw(args.sets, size, outliers, args.rotated), estimators, layer)
                 print(f"N = {size}, {outliers:.0%} outliers\n\n{format_table(HEADER, found)}\n", flush=True)
                 rows += [[f"{outliers:.0%}", str(size), *row] for row in found]
     write_csv(args.csv, [header, *rows])

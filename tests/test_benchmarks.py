@@ -140,7 +140,7 @@ def test_poses_of_a_store(tmp_path):
     store, file = tmp_path / "pairs.h5", tmp_path / "poses.csv"
     write_store(store, synthetic_store(2, points=80, scenes=["orbit"]))
     names = ["RANSAC-calibrated", "learned:robust-pose-synthetic+scores"]
-    poses.main([str(store), "--estimators", *names, "--csv", str(file)])
+    poses.main([str(store), "--rotated", "90", "--estimators", *names, "--csv", str(file)])
     header, *rows = read_csv(file)
     assert header == ["store", *poses.HEADER]
     assert [row[:2] for row in rows] == [["pairs", name] for name in names]
@@ -149,7 +149,7 @@ def test_poses_of_a_store(tmp_path):
 
 def test_planes(tmp_path):
     file = tmp_path / "planes.csv"
-    planes.main(["--sizes", "64", "--outliers", "0.2", "--sets", "3", "--csv", str(file)])
+    planes.main(["--sizes", "64", "--outliers", "0.2", "--sets", "3", "--rotated", "90", "--csv", str(file)])
     header, *rows = read_csv(file)
     assert header == ["outliers", "N", *planes.HEADER]
     errors = {row[2]: float(row[3]) for row in rows}
