@@ -127,11 +127,6 @@ def test_blocks_without_samples(store, tmp_path):
     raises(ValueError, r"no pair of .*few\.h5 has 9 correspondences", StoreSamples, [str(tmp_path / "few.h5")], size=9)
 
 
-@pytest.mark.parametrize("arguments", [{"size": (7, 8)}, {"size": (9, 8)}, {"block_pairs": 0}])
-def test_bad_sources(sources, arguments):
-    raises(ValueError, "at least 8 correspondences, a block at least one pair, got", sources, **arguments)
-
-
 @pytest.mark.parametrize("kind", [StoreSamples, StoreSets])
 def test_draws_that_cannot_be(sources, kind):
     for arguments, message in [
@@ -177,11 +172,10 @@ def test_filter_agrees_with_numpy(store, monkeypatch):
     np.testing.assert_allclose(plain_residual(*samples[:2]).numpy()[near], expected[near], rtol=1e-3)
 
 
-def test_bad_arguments(store):
-    for arguments, message in [
-        ({"size": 7}, "size=7"),
-        ({"max_ratio": 0.1}, "no pair of the store"),
-    ]:
+def test_bad_arguments(store, sources):
+    for arguments in ({"size": (7, 8)}, {"size": (9, 8)}, {"block_pairs": 0}):
+        raises(ValueError, "at least 8 correspondences, a block at least one pair, got", sources, **arguments)
+    for arguments, message in [({"size": 7}, "size=7"), ({"max_ratio": 0.1}, "no pair of the store")]:
         raises(ValueError, message, draw_samples, store, seeded(), **arguments)
 
 
