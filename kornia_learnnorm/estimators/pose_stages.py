@@ -227,6 +227,7 @@ def _rays(frame: CommonFrame, model: Essential, x1: Tensor, x2: Tensor) -> Tenso
     rays = torch.stack([model.C1 @ x1, model.C2 @ x2], 1)
     rays = torch.where(frame.swapped[:, None, None, None], rays.flip(1), rays)
     rays = (rays[:, :, :2] / rays[:, :, 2:]).clamp(-MAX_RAY, MAX_RAY)
+    rays = torch.stack([rays[:, 0], frame.upright @ rays[:, 1]], 1)
     unit = (frame.inverse[:, :1, :1] / 100).log().expand(-1, 1, rays.shape[-1])
     return torch.cat([rays.flatten(1, 2), unit], 1).mT
 

@@ -12,7 +12,7 @@ from kornia_learnnorm.estimators.optimize import refine_unrolled
 from kornia_learnnorm.geometry.checks import is_known_true, weighted_mean
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem
-from kornia_learnnorm.geometry.transforms import spd_transform
+from kornia_learnnorm.geometry.transforms import affine_transform, spd_transform
 from kornia_learnnorm.models.two_view_model import TwoViewModel
 
 EARLY_STEPS = 3  # largest number of refinement steps in all stages but the last
@@ -87,8 +87,11 @@ def _solve_weighted(
     if params is None:
         return solve_in_coordinates(weighted, weighted.T1, weighted.T2)
     params = torch.unflatten(BOUND * torch.tanh(params / BOUND), -1, (2, TRANSFORM_PARAMS))
-    params = torch.where(frame.swapped[:, None, None], params.flip(1), params)
-    T1, T2 = (spd_transform(params) @ torch.stack([weighted.T1, weighted.T2], 1)).unbind(1)
+    swapped, own = frame.swapped[:, None, None, None], torch.stack([weighted.T1, weighted.T2], 1)
+    first, second = torch.where(swapped, own.flip(1), own).unbind(1)
+    upright = affine_transform(frame.upright, torch.zeros_like(frame.upright[:, 0]))
+    T = spd_transform(params) @ torch.stack([first, upright @ second], 1)
+    T1, T2 = torch.where(swapped, T.flip(1), T).unbind(1)
     return solve_in_coordinates(weighted, T1, T2)
 
 
