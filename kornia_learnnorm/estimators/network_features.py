@@ -28,7 +28,6 @@ class CommonFrame(NamedTuple):
     T: Tensor  # from pixels to the frame, the same for both views, (B, 3, 3)
     inverse: Tensor  # from the frame to pixels, (B, 3, 3)
     swapped: Tensor  # whether the canonical order of the views is the second before the first, (B,) bool
-    upright: Tensor  # rotation that sets the view that comes second in this order upright, (B, 2, 2)
 
     @classmethod
     def from_points(cls, points1: Tensor, points2: Tensor, present: Tensor | None) -> CommonFrame:
@@ -51,39 +50,40 @@ class CommonFrame(NamedTuple):
         inverse = [radius, zero, x, zero, radius, y, zero, zero, one]
         T, back = torch.unflatten(torch.stack([torch.stack(entries, -1), torch.stack(inverse, -1)]), -1, (3, 3))
         x1, x2 = ((points - origin[:, None, None]) / radius[:, None, None, None]).unbind(1)
-        swapped = distances[1, :, 0].detach() > distances[1, :, 1].detach()
-        present = torch.ones_like(points[:, 0, :, 0]) if present is None else present
-        centred = ((points - mean[:, :, None]) / radius[:, None, None, None]).detach()
-        return cls(x1, x2, T, back, swapped, _upright(centred, swapped, present))
+        return cls(x1, x2, T, back, distances[1, :, 0].detach() > distances[1, :, 1].detach())
+
+    @torch.no_grad()
+    def upright(self, present: Tensor | None) -> Tensor:
+        """Return the rotations (B, 3, 3) that set the view upright that comes second in the canonical order.
+
+        The least-squares rotation between two sets of points has the angle of their correlation as complex numbers (B.
+        Horn, Closed-form solution of absolute orientation using unit quaternions, 1987). Views that are rotated by up
+        to 45 degrees count as upright, and so do those whose correlation is no larger than expected of random matches.
+        """
+        points = torch.stack([self.x1, self.x2], 1)
+        points = points - weighted_mean(points, None if present is None else present[:, None])[:, :, None]
+        points = points if present is None else points * present[:, None, :, None]
+        first, second = points.unbind(1)
+        C = first.mT @ second
+        along, across = C[:, 0, 0] + C[:, 1, 1], C[:, 0, 1] - C[:, 1, 0]
+        length, by_chance = torch.hypot(along, across), points.square().sum(-1).prod(1).sum(1).sqrt()
+        rotated = (along < across.abs()) & (length > by_chance)
+        cos, sin = torch.where(rotated, along / length, 1.0), torch.where(rotated, across / length, 0.0)
+        sin = torch.where(self.swapped, -sin, sin)
+        one, zero = torch.ones_like(cos), torch.zeros_like(cos)
+        return torch.unflatten(torch.stack([cos, sin, zero, -sin, cos, zero, zero, zero, one], -1), -1, (3, 3))
 
 
-def _upright(centred: Tensor, swapped: Tensor, present: Tensor) -> Tensor:
-    """Return the rotations (B, 2, 2) that set the second view of centred points (B, 2, N, 2) upright.
-
-    The least-squares rotation between two sets of points has the angle of their correlation as complex numbers (B.
-    Horn, Closed-form solution of absolute orientation using unit quaternions, 1987). Views that are rotated by up to 45
-    degrees count as upright, and so do those whose correlation is no larger than expected of random matches.
-    """
-    first, second = torch.where(swapped[:, None, None, None], centred.flip(1), centred).unbind(1)
-    (x1, y1), (x2, y2) = first.unbind(-1), second.unbind(-1)
-    along, across = ((x1 * x2 + y1 * y2) * present).sum(1), ((x1 * y2 - y1 * x2) * present).sum(1)
-    length = (along.square() + across.square()).sqrt()
-    by_chance = (first.square().sum(-1) * second.square().sum(-1) * present).sum(1).sqrt()
-    rotated = (along < across.abs()) & (length > by_chance)
-    cos, sin = torch.where(rotated, along / length, 1.0), torch.where(rotated, across / length, 0.0)
-    return torch.unflatten(torch.stack([cos, sin, -sin, cos], -1), -1, (2, 2))
-
-
-def match_features(frame: CommonFrame, scores: Tensor | None, present: Tensor | None) -> Tensor:
+def match_features(frame: CommonFrame, upright: Tensor, scores: Tensor | None, present: Tensor | None) -> Tensor:
     r"""Return the features of correspondences before any matrix is known, :math:`(B, N, 9)`.
 
     Both points, their displacement from the median displacement over the median deviation, the score and whether there
-    is one, and the number of correspondences. The second view is set upright about the mean of its points.
+    is one, and the number of correspondences. The rotations ``upright`` turn the second view about its mean.
     """
     swapped = frame.swapped[:, None, None]
     first, second = torch.where(swapped, frame.x2, frame.x1), torch.where(swapped, frame.x1, frame.x2)
     centre = weighted_mean(second, present)[:, None]
-    second = centre + (second - centre) @ frame.upright.mT
+    second = centre + (second - centre) @ upright[:, :2, :2].mT
     shift = second - first
     shift = shift - masked_median(shift, present)
     deviation = masked_median(shift.norm(dim=-1, keepdim=True), present)

@@ -56,7 +56,9 @@ def run_pose_stages(
     model = Essential.of_cameras(K1, K2, frame.T, frame.T)
     evidence, unit = Evidence.from_points(x1, x2), frame.inverse[:, 0, 0, None]
     matches = _Matches(evidence, model, unit)
-    features = torch.cat([match_features(frame, scores, present), _rays(frame, model, x1, x2)], -1)
+    upright = frame.upright(present)
+    rays = _rays(frame, upright, model, x1, x2)
+    features = torch.cat([match_features(frame, upright, scores, present), rays], -1)
     states: list[Calibrated] = []
     found: list[Tensor] = []
     settled = torch.zeros_like(problem.x1[:, 0, 0], dtype=torch.bool)
@@ -222,12 +224,12 @@ class _Matches(NamedTuple):
         return kept
 
 
-def _rays(frame: CommonFrame, model: Essential, x1: Tensor, x2: Tensor) -> Tensor:
+def _rays(frame: CommonFrame, upright: Tensor, model: Essential, x1: Tensor, x2: Tensor) -> Tensor:
     """Return the directions of both points and the frame's unit in pixels as features, (B, N, 5)."""
     rays = torch.stack([model.C1 @ x1, model.C2 @ x2], 1)
-    rays = torch.where(frame.swapped[:, None, None, None], rays.flip(1), rays)
+    first, second = torch.where(frame.swapped[:, None, None, None], rays.flip(1), rays).unbind(1)
+    rays = torch.stack([first, upright @ second], 1)
     rays = (rays[:, :, :2] / rays[:, :, 2:]).clamp(-MAX_RAY, MAX_RAY)
-    rays = torch.stack([rays[:, 0], frame.upright @ rays[:, 1]], 1)
     unit = (frame.inverse[:, :1, :1] / 100).log().expand(-1, 1, rays.shape[-1])
     return torch.cat([rays.flatten(1, 2), unit], 1).mT
 

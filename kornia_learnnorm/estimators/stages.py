@@ -12,7 +12,7 @@ from kornia_learnnorm.estimators.optimize import refine_unrolled
 from kornia_learnnorm.geometry.checks import is_known_true, weighted_mean
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem
-from kornia_learnnorm.geometry.transforms import affine_transform, spd_transform
+from kornia_learnnorm.geometry.transforms import spd_transform
 from kornia_learnnorm.models.two_view_model import TwoViewModel
 
 EARLY_STEPS = 3  # largest number of refinement steps in all stages but the last
@@ -33,7 +33,8 @@ def run_stages(layer: Any, problem: LinearProblem, scores: Tensor | None) -> tup
     """
     model, present, detach_stages = layer.model, problem.present, layer.detach_stages
     frame = CommonFrame.from_points(problem.points1, problem.points2, present)
-    features, factor = match_features(frame, scores, present), None
+    upright, factor = frame.upright(present), None
+    features = match_features(frame, upright, scores, present)
     found: list[tuple[Tensor, Tensor]] = []
     with torch.set_grad_enabled(torch.is_grad_enabled() and not detach_stages):
         refine: Refinement = layer.refinement(model, problem, frame, layer.samples, not layer.training)
@@ -53,7 +54,7 @@ def run_stages(layer: Any, problem: LinearProblem, scores: Tensor | None) -> tup
         logits, params = logits.to(problem.x1), params.to(problem.x1)
         weights = logits.sigmoid() if factor is None else logits.sigmoid() * factor
         weights = weights if problem.weights is None else weights * problem.weights
-        M = _solve_weighted(model, frame, weights, present, params if layer.learn_transforms else None)
+        M = _solve_weighted(model, frame, upright, weights, present, params if layer.learn_transforms else None)
         if settled is not None:
             M = torch.where(settled[:, None, None], found[0][0], M)
             logits = torch.where(settled[:, None], found[0][1], logits)
@@ -78,7 +79,12 @@ def in_pieces(problem: LinearProblem, *values: Tensor | None) -> list[tuple[Any,
 
 
 def _solve_weighted(
-    model: TwoViewModel, frame: CommonFrame, weights: Tensor, present: Tensor | None, params: Tensor | None
+    model: TwoViewModel,
+    frame: CommonFrame,
+    upright: Tensor,
+    weights: Tensor,
+    present: Tensor | None,
+    params: Tensor | None,
 ) -> Tensor:
     """Return the matrices of the weighted DLT with the predicted transforms, or Hartley's, in the frame."""
     weights = weights / weights.amax(1, keepdim=True)
@@ -89,7 +95,6 @@ def _solve_weighted(
     params = torch.unflatten(BOUND * torch.tanh(params / BOUND), -1, (2, TRANSFORM_PARAMS))
     swapped, own = frame.swapped[:, None, None, None], torch.stack([weighted.T1, weighted.T2], 1)
     first, second = torch.where(swapped, own.flip(1), own).unbind(1)
-    upright = affine_transform(frame.upright, torch.zeros_like(frame.upright[:, 0]))
     T = spd_transform(params) @ torch.stack([first, upright @ second], 1)
     T1, T2 = torch.where(swapped, T.flip(1), T).unbind(1)
     return solve_in_coordinates(weighted, T1, T2)

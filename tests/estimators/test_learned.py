@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from pairwise import pairwise
 from references import check_gradients, check_refuses, corner_error, numpy_sampson, signless, true_essential, up_to_sign
 from scenes import DTYPES, inputs, plane, raises, rewrite_weights, roughened, scenes, seeded, shaken_estimator, uniform
@@ -66,6 +67,23 @@ def test_invariances(kind, more, seed, factor, shift):
     T = torch.tensor([[factor, 0, factor * shift], [0, factor, factor * shift], [0, 0, 1]], dtype=torch.float64)
     moved = layer(factor * (points1 + shift), factor * (points2 + shift), *(T @ K for K in cameras))
     assert up_to_sign(moved if kind == "pose" else layer.model.carry(moved, T, T), found[0]) < 1e-5
+
+
+@every
+@settings(max_examples=3)
+@given(st.floats(120, 240))
+@torch.no_grad()
+def test_networks_see_a_rotated_image_upright(kind, degrees):
+    """Where it is the second in the canonical order, as in all of these but the first plane."""
+    points, K = inputs(kind, 4, 100, scene="driving")[:2], torch.diag(torch.tensor([600.0, 600.0, 1.0]).double())
+    R = axis_angle_to_rotation_matrix(torch.deg2rad(torch.tensor([[0.0, 0.0, 180.0], [0.0, 0.0, degrees]]))).double()
+    points1, points2 = (p[1:] - p[1:].mean(1, keepdim=True) for p in points)
+    found, other = (
+        LAYERS[kind]().estimate(points1, points2 @ rotation[:2, :2].mT, *(2 * [K] if kind == "pose" else []))
+        for rotation in R
+    )
+    assert torch.allclose(found.stages[0].logits, other.stages[0].logits, atol=1e-6)
+    assert up_to_sign(R[0].mT @ found[0], R[1].mT @ other[0]) < 1e-5
 
 
 @pytest.mark.parametrize(
