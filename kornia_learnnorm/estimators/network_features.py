@@ -18,6 +18,7 @@ POINT_FEATURES, RESIDUAL_FEATURES = 9, 5  # numbers of a correspondence
 RESIDUAL_FLOOR = 1e-5  # of the frame's unit, added to distances before their logarithm
 DEVIATION_FLOOR = 1e-5  # of the frame's unit: the rounding of an exact shift of the image says nothing
 MIN_PROBABILITY = 1e-3  # added to the probabilities of inliers in a mean
+FAR_FROM_CHANCE = 1.5  # correlations of rotated views, in root mean squares of those of random matches
 
 
 class CommonFrame(NamedTuple):
@@ -58,7 +59,7 @@ class CommonFrame(NamedTuple):
 
         The least-squares rotation between two sets of points has the angle of their correlation as complex numbers (B.
         Horn, Closed-form solution of absolute orientation using unit quaternions, 1987). Views that are rotated by up
-        to 45 degrees count as upright, and so do those whose correlation is no larger than expected of random matches.
+        to 45 degrees count as upright, and so do those whose correlation may be that of random matches.
         """
         points = torch.stack([self.x1, self.x2], 1)
         points = points - weighted_mean(points, None if present is None else present[:, None])[:, :, None]
@@ -67,7 +68,7 @@ class CommonFrame(NamedTuple):
         C = first.mT @ second
         along, across = C[:, 0, 0] + C[:, 1, 1], C[:, 0, 1] - C[:, 1, 0]
         length, by_chance = torch.hypot(along, across), points.square().sum(-1).prod(1).sum(1).sqrt()
-        rotated = (along < across.abs()) & (length > by_chance)
+        rotated = (along < across.abs()) & (length > FAR_FROM_CHANCE * by_chance)
         cos, sin = torch.where(rotated, along / length, 1.0), torch.where(rotated, across / length, 0.0)
         sin = torch.where(self.swapped, -sin, sin)
         one, zero = torch.ones_like(cos), torch.zeros_like(cos)
