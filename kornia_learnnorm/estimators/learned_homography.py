@@ -150,9 +150,7 @@ class LearnedHomography(LearnedLayer):
     order of the correspondences has no effect. Swapping the views gives :math:`H^{-1}` up to scale. :math:`H` is
     equivariant to a translation and a scale that are common to both images.
 
-    Do not use it on scenes with relief: it returns the homography that most matches agree on, without a warning. Among
-    many outliers and without scores it fails more often if one image is rotated by more than about 90 degrees against
-    the other, which was rare in its training: rotate the image first, or pass scores.
+    Do not use it on scenes with relief: it returns the homography that most matches agree on, without a warning.
 
     Args:
         width: channels of the networks.

@@ -64,8 +64,7 @@ class LearnedRelativePose(LearnedLayer):
     The order of the correspondences has no effect. Swapping the views, with their cameras, gives :math:`E^\top` up to
     sign. Up to ten matrices fit five correspondences exactly; rounding may then choose one. Planes and forward motion
     need no special treatment. A camera that only rotates has no translation: the returned direction is arbitrary.
-    Undistort the points first if the distortion is known. Among many outliers and without scores it fails more often if
-    one image is rotated by more than about 135 degrees against the other: rotate the image first, or pass scores.
+    Undistort the points first if the distortion is known.
 
     Args:
         width: channels of the networks.
