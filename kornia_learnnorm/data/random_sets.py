@@ -7,7 +7,6 @@ from functools import partial
 from typing import Protocol
 
 import torch
-from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from kornia.geometry.epipolar import cross_product_matrix
 from torch import Generator, Tensor
 
@@ -23,26 +22,6 @@ from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 
 MIN_HELDOUT = 32  # true inliers of a pair that is used, or matches where they are not known
 LABEL_THRESHOLD = 2.0  # pixels from the true epipolar lines up to which a match counts as an inlier
-
-
-def rotate_second(sets: MatchSets, generator: Generator, share: float = 1.0) -> MatchSets:
-    """Return sets of which a share has the second camera turned about its optical axis by any angle.
-
-    Where cameras are unknown, the image plane turns about the mean of its points.
-    """
-    if sets.image1 is not None:
-        raise ValueError("sets with images are not rotated: set rotated to 0")
-    shape = (len(sets.points2), 1)
-    rotated = uniform(shape, 0.0, 1.0, generator) < share
-    angle = torch.where(rotated, uniform(shape, -math.pi, math.pi, generator), 0.0)
-    R = axis_angle_to_rotation_matrix(angle * angle.new_tensor([0.0, 0.0, 1.0])).to(sets.points2)
-    K = affine_transform(torch.eye(2).to(R).expand(len(R), 2, 2), -sets.points2.mean(1))
-    K = K if sets.K2 is None else torch.where(sets.K2.isnan(), K, sets.K2)
-    points2, heldout2 = (
-        transform_points(points, K @ R @ torch.linalg.inv(K)) for points in (sets.points2, sets.heldout2)
-    )
-    E_mat = None if sets.E_mat is None else R @ sets.E_mat
-    return sets._replace(points2=points2, heldout2=heldout2, E_mat=E_mat)
 
 
 def augment(sets: MatchSets, generator: Generator) -> MatchSets:
@@ -231,7 +210,6 @@ class RandomSets:
         correspondences: matches in a batch, of all its sets.
         max_sets: largest number of sets in a batch.
         augmented: share of the batches that are augmented.
-        rotated: share of the sets whose second camera is turned about its optical axis, by any angle.
         scored: share of the batches that have scores.
         batches: batches in an epoch.
     """
@@ -242,7 +220,6 @@ class RandomSets:
     correspondences: int = 4096
     max_sets: int = 256
     augmented: float = 0.4
-    rotated: float = 0.0
     scored: float = 0.5
     batches: int = 500
 
@@ -271,8 +248,6 @@ class RandomSets:
         low, high = self.sizes
         num_points = round(low * math.exp(size * math.log(high / low)))
         sets = source.draw(max(1, min(self.max_sets, self.correspondences // num_points)), num_points, generator)
-        if self.rotated:
-            sets = rotate_second(sets, generator, self.rotated)
         if augmented < self.augmented:
             sets = augment(sets, generator)
         return sets if scored < self.scored else sets._replace(scores=None)

@@ -12,7 +12,7 @@ from scenes import raises, scenes, seeded
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.match_sets import MatchSets
-from kornia_learnnorm.data.random_sets import RandomSets, StoreSets, SyntheticSets, augment, rotate_second
+from kornia_learnnorm.data.random_sets import RandomSets, StoreSets, SyntheticSets, augment
 from kornia_learnnorm.data.synthetic.random_matches import random_matches, random_planes, wide_baseline
 from kornia_learnnorm.data.synthetic.scenes import synthetic_store
 from kornia_learnnorm.data.writer import write_store
@@ -147,29 +147,20 @@ def test_wrong_options():
         raises(ValueError, message, RandomSets, **{"sources": [SyntheticSets()]} | arguments)
     sets = SyntheticSets().draw(2, 9, seeded())._replace(image1=torch.zeros(2, 1, 4, 4))
     raises(ValueError, "sets with images are not augmented: set augmented to 0", augment, sets, seeded())
-    raises(ValueError, "sets with images are not rotated: set rotated to 0", rotate_second, sets, seeded())
 
 
 class TestAugment:
-    @pytest.mark.parametrize("change", [augment, rotate_second])
     @given(seed=st.integers(0, 2**20))
-    def test_keeps_the_epipolar_geometry(self, seed, change):
+    def test_keeps_the_epipolar_geometry(self, seed):
         """Exact correspondences stay exact, in cameras that take the maps."""
         scene, zero = scenes("handheld", 4, 40, noise=0.0), torch.zeros(4, 40)
         views = scene.points1, scene.points2
         known = zero, zero + 1, zero[:, 0] > 0, scene.K1, scene.K2, true_essential(scene)
-        moved = change(MatchSets(*views, *views, torch.arange(4), *known), seeded(seed))
+        moved = augment(MatchSets(*views, *views, torch.arange(4), *known), seeded(seed))
         F_mat = torch.linalg.inv(moved.K2).mT @ moved.E_mat @ torch.linalg.inv(moved.K1)
         assert kln.symmetric_epipolar_distance(moved.heldout1, moved.heldout2, F_mat).max() < 1e-3
         kept = moved.inliers > 0
         assert torch.equal(kept, (moved.points2 == moved.heldout2).all(-1))  # a false match has another partner
         assert kln.symmetric_epipolar_distance(moved.points1, moved.points2, F_mat)[kept].max() < 1e-3
         assert kept.double().mean() > 0.55
-        assert change(MatchSets(*views, *views, torch.arange(4)), seeded()).scores is None
-
-    @pytest.mark.parametrize("K2", [None, torch.full((200, 3, 3), torch.nan)])
-    def test_rotates_a_share_about_the_mean_without_cameras(self, K2):
-        sets = SyntheticSets(8).draw(200, 20, seeded())._replace(K2=K2)
-        moved, centre = rotate_second(sets, seeded(), 0.25).points2, sets.points2.mean(1, keepdim=True)
-        assert torch.allclose((moved - centre).norm(dim=-1), (sets.points2 - centre).norm(dim=-1), rtol=1e-4, atol=0.1)
-        assert 0.15 < ((moved - sets.points2).abs() > 1).any(-1).any(-1).double().mean() < 0.35
+        assert augment(MatchSets(*views, *views, torch.arange(4)), seeded()).scores is None
