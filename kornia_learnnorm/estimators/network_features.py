@@ -53,26 +53,26 @@ class CommonFrame(NamedTuple):
         x1, x2 = ((points - origin[:, None, None]) / radius[:, None, None, None]).unbind(1)
         return cls(x1, x2, T, back, distances[1, :, 0].detach() > distances[1, :, 1].detach())
 
-    @torch.no_grad()
-    def upright(self, present: Tensor | None) -> Tensor:
-        """Return the rotations (B, 3, 3) that set the view upright that comes second in the canonical order.
 
-        The least-squares rotation between two sets of points has the angle of their correlation as complex numbers (B.
-        Horn, Closed-form solution of absolute orientation using unit quaternions, 1987). Views that are rotated by up
-        to 45 degrees count as upright, and so do those whose correlation may be that of random matches.
-        """
-        points = torch.stack([self.x1, self.x2], 1)
-        points = points - weighted_mean(points, None if present is None else present[:, None])[:, :, None]
-        points = points if present is None else points * present[:, None, :, None]
-        first, second = points.unbind(1)
-        C = first.mT @ second
-        along, across = C[:, 0, 0] + C[:, 1, 1], C[:, 0, 1] - C[:, 1, 0]
-        length, by_chance = torch.hypot(along, across), points.square().sum(-1).prod(1).sum(1).sqrt()
-        rotated = (along < across.abs()) & (length > FAR_FROM_CHANCE * by_chance)
-        cos, sin = torch.where(rotated, along / length, 1.0), torch.where(rotated, across / length, 0.0)
-        sin = torch.where(self.swapped, -sin, sin)
-        one, zero = torch.ones_like(cos), torch.zeros_like(cos)
-        return torch.unflatten(torch.stack([cos, sin, zero, -sin, cos, zero, zero, zero, one], -1), -1, (3, 3))
+def upright_rotation(frame: CommonFrame, present: Tensor | None) -> Tensor:
+    """Return the rotations (B, 3, 3) that set the view upright that comes second in the canonical order.
+
+    The least-squares rotation between two sets of points has the angle of their correlation as complex numbers (B.
+    Horn, Closed-form solution of absolute orientation using unit quaternions, 1987). Views that are rotated by up
+    to 45 degrees count as upright, and so do those whose correlation may be that of random matches.
+    """
+    points = torch.stack([frame.x1, frame.x2], 1).detach()
+    points = points - weighted_mean(points, None if present is None else present[:, None])[:, :, None]
+    points = points if present is None else points * present[:, None, :, None]
+    first, second = points.unbind(1)
+    C = first.mT @ second
+    along, across = C[:, 0, 0] + C[:, 1, 1], C[:, 0, 1] - C[:, 1, 0]
+    length, by_chance = torch.hypot(along, across), points.square().sum(-1).prod(1).sum(1).sqrt()
+    rotated = (along < across.abs()) & (length > FAR_FROM_CHANCE * by_chance)
+    cos, sin = torch.where(rotated, along / length, 1.0), torch.where(rotated, across / length, 0.0)
+    sin = torch.where(frame.swapped, -sin, sin)
+    one, zero = torch.ones_like(cos), torch.zeros_like(cos)
+    return torch.unflatten(torch.stack([cos, sin, zero, -sin, cos, zero, zero, zero, one], -1), -1, (3, 3))
 
 
 def match_features(frame: CommonFrame, upright: Tensor, scores: Tensor | None, present: Tensor | None) -> Tensor:
@@ -84,7 +84,7 @@ def match_features(frame: CommonFrame, upright: Tensor, scores: Tensor | None, p
     swapped = frame.swapped[:, None, None]
     first, second = torch.where(swapped, frame.x2, frame.x1), torch.where(swapped, frame.x1, frame.x2)
     centre = weighted_mean(second, present)[:, None]
-    second = centre + (second - centre) @ upright[:, :2, :2].mT
+    second = second + (second - centre) @ (upright[:, :2, :2].mT - torch.eye(2).to(upright))
     shift = second - first
     shift = shift - masked_median(shift, present)
     deviation = masked_median(shift.norm(dim=-1, keepdim=True), present)

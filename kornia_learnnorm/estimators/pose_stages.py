@@ -8,7 +8,12 @@ from torch import Tensor
 
 from kornia_learnnorm.estimators.camera_evidence import contradict_cameras, keeps_fit
 from kornia_learnnorm.estimators.moments import Evidence, SquareScale, descend, geometric_scale, least_cost, pick
-from kornia_learnnorm.estimators.network_features import CommonFrame, match_features, residual_features
+from kornia_learnnorm.estimators.network_features import (
+    CommonFrame,
+    match_features,
+    residual_features,
+    upright_rotation,
+)
 from kornia_learnnorm.estimators.optimize import choose, differentiable_state
 from kornia_learnnorm.estimators.stages import few_outliers
 from kornia_learnnorm.estimators.weighted_samples import evenly_ranked, sample_null_spaces
@@ -56,7 +61,7 @@ def run_pose_stages(
     model = Essential.of_cameras(K1, K2, frame.T, frame.T)
     evidence, unit = Evidence.from_points(x1, x2), frame.inverse[:, 0, 0, None]
     matches = _Matches(evidence, model, unit)
-    upright = frame.upright(present)
+    upright = upright_rotation(frame, present)
     rays = _rays(frame, upright, model, x1, x2)
     features = torch.cat([match_features(frame, upright, scores, present), rays], -1)
     states: list[Calibrated] = []

@@ -7,7 +7,12 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
 from kornia_learnnorm.estimators.linear import solve_in_coordinates
-from kornia_learnnorm.estimators.network_features import CommonFrame, match_features, residual_features
+from kornia_learnnorm.estimators.network_features import (
+    CommonFrame,
+    match_features,
+    residual_features,
+    upright_rotation,
+)
 from kornia_learnnorm.estimators.optimize import refine_unrolled
 from kornia_learnnorm.geometry.checks import is_known_true, weighted_mean
 from kornia_learnnorm.geometry.matrices import unit_matrix
@@ -33,7 +38,7 @@ def run_stages(layer: Any, problem: LinearProblem, scores: Tensor | None) -> tup
     """
     model, present, detach_stages = layer.model, problem.present, layer.detach_stages
     frame = CommonFrame.from_points(problem.points1, problem.points2, present)
-    upright, factor = frame.upright(present), None
+    upright, factor = upright_rotation(frame, present), None
     features = match_features(frame, upright, scores, present)
     found: list[tuple[Tensor, Tensor]] = []
     with torch.set_grad_enabled(torch.is_grad_enabled() and not detach_stages):
