@@ -148,8 +148,8 @@ class LearnedEightPoint(LearnedLayer):
 
     The order of the correspondences has no effect. Swapping the views gives :math:`F^\top` up to sign. :math:`F` is
     equivariant to a translation and a scale that are common to both images; to rotations and different scales only
-    approximately, by training. If one image is rotated by more than 45 degrees against the other, by the
-    correspondences' least-squares rotation, the networks read its points turned upright.
+    approximately, by training. Where the least-squares rotation from one view's points to the other's is larger than 45
+    degrees, the networks read the points of one view rotated back.
 
     Args:
         width: channels of the networks.

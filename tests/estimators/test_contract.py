@@ -153,8 +153,6 @@ def test_points_on_the_epipoles_are_finite_in_value_and_gradient(kind, correctio
 
 
 EYE = torch.eye(3).expand(2, 3, 3)
-
-
 REFUSING = [(find_fundamental, 8), (kln.EightPoint(), 8), (find_homography, 4)]
 REFUSING += [(lambda *points: optimal_rank2(EYE, *points), 8)]
 REFUSING += [(lambda points1, points2, weights: refine_fundamental(points1, points2, EYE, weights), 8)]
