@@ -178,8 +178,7 @@ REFERENCES = {
 }
 
 
-def scaling(a, *_):
-    """From a thousandth to a thousand times the size."""
+def scaling(a, *_):  # from a thousandth to a thousand times the size
     return [[10 ** (6 * a), 0], [0, 10 ** (6 * a)]]
 
 

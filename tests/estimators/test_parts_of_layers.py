@@ -58,8 +58,7 @@ def drawn_rows(size):
 def test_large_samples_against_singular_vectors():
     evidence, options, rows = drawn_rows(20)
     found = fit_samples(evidence, *options).mT.flatten(2).numpy()  # x2^T F x1 of column-major rows
-    expected = np.linalg.svd(rows)[2][:, :, -1]
-    np.testing.assert_allclose(np.abs((found * expected).sum(-1)), 1.0, rtol=1e-9)
+    np.testing.assert_allclose(np.abs((found * np.linalg.svd(rows)[2][:, :, -1]).sum(-1)), 1.0, rtol=1e-9)
 
 
 @pytest.mark.parametrize("size", [5, 7])

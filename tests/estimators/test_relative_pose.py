@@ -87,8 +87,8 @@ def test_cameras_are_left_where_matches_contradict_them():
     """The matrix is essential still, the pose better than with the cameras; right ones stay."""
     layer, errors = kln.LearnedRelativePose.from_pretrained(), []
     scene = scenes("handheld", 8, 400, noise=0.3)
-    cameras = scene.K1, scene.K2
-    moved = [distorted(p, K, -0.1) for p, K in zip((scene.points1, scene.points2), cameras, strict=True)]
+    points, cameras = (scene.points1, scene.points2), (scene.K1, scene.K2)
+    moved = [distorted(p, K, -0.1) for p, K in zip(points, cameras, strict=True)]
     never = (camera_evidence, "MIN_EFFECT", torch.inf), (camera_evidence, "MIN_KEPT", torch.inf)
     for limit in ((camera_evidence, "MIN_KEPT", 0.3), *never):
         with pytest.MonkeyPatch.context() as patch:
@@ -99,7 +99,6 @@ def test_cameras_are_left_where_matches_contradict_them():
             assert torch.allclose(values[:, 0], values[:, 1], rtol=1e-9)
     assert errors[0].median() < 0.8 * errors[1].median()
     assert torch.equal(errors[1], errors[2])  # a pose without cameras has to fit the correspondences
-    points = scene.points1, scene.points2
     kept = layer(*points, *cameras)
     few, alike = [p[:, :40] for p in moved], torch.ones(8, 40)
     assert up_to_sign(layer(*few, *cameras, alike * 1e3).detach(), layer(*few, *cameras, alike).detach()) < 1e-4
@@ -134,8 +133,7 @@ def test_contradiction_is_that_of_an_f_test():
     T = torch.diag(torch.tensor([1 / 200, 1 / 200, 1.0], dtype=torch.float64))[None]
     model = Essential.of_cameras(scene.K1, scene.K2, T, T)
     evidence, weights = Evidence.from_points(*points), torch.ones(1, 300, dtype=torch.float64)
-    start = model.calibrated(true_essential(scene))
-    scale = torch.full((1, 1), 0.02, dtype=torch.float64)
+    start, scale = model.calibrated(true_essential(scene)), torch.full((1, 1), 0.02, dtype=torch.float64)
     state = minimize(RobustCost(model, *points, weights, GemanMcClure(0.02)), start, 50, 1e-9)[1].state
     F_mat = state.matrix()
     distance, J = Fundamental().linearise(F_mat, *points)
