@@ -43,7 +43,7 @@ from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.metrics.poses import pose_error
 from kornia_learnnorm.two_view.estimate_matches import estimate_matches
 from kornia_learnnorm.two_view.estimate_pair import estimate_pair, match_two_images
-from kornia_learnnorm.two_view.inputs import MODELS
+from kornia_learnnorm.two_view.input_checks import MODELS
 from kornia_learnnorm.two_view.parallax import parallax
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 

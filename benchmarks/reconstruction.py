@@ -25,7 +25,7 @@ from shared import make_parser, write_csv
 
 from kornia_learnnorm.data.datasets.pairing import choose_pairs
 from kornia_learnnorm.data.datasets.reading import read_folder
-from kornia_learnnorm.data.matching.match_store import MatchOptions, collect_matches
+from kornia_learnnorm.data.matching.frame_matching import MatchOptions, collect_matches
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.evaluation.tables import format_table

@@ -17,7 +17,7 @@ from .estimators.refinement import refine_essential, refine_fundamental
 from .estimators.robust_losses import Cauchy, GemanMcClure, Huber, Truncated
 from .geometry.distances import algebraic_distance, sampson_distance, symmetric_epipolar_distance, transfer_distance
 from .geometry.pose import relative_pose
-from .geometry.rank2 import optimal_rank2
+from .geometry.rank2_correction import optimal_rank2
 from .normalizers.closed_form import Hartley, Identity, Whitening
 from .normalizers.learned_normalizer import LearnedNormalizer
 from .normalizers.networks.crossview import CrossViewNetwork

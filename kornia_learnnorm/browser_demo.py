@@ -26,7 +26,7 @@ from kornia_learnnorm.data.synthetic.render import render_pair, write_pair
 from kornia_learnnorm.geometry.checks import check_choice
 from kornia_learnnorm.two_view.drawing import INLIER, OUTLIER, blend_images, draw_line, import_matplotlib, stacked
 from kornia_learnnorm.two_view.estimate_pair import estimate_pair
-from kornia_learnnorm.two_view.inputs import MODELS
+from kornia_learnnorm.two_view.input_checks import MODELS
 from kornia_learnnorm.two_view.many_pairs import PairOptions
 from kornia_learnnorm.two_view.result import PairEstimate
 

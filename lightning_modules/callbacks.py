@@ -18,8 +18,8 @@ from torch import Tensor, distributed
 from tqdm import tqdm
 
 from kornia_learnnorm import EightPoint, LearnedNormalizer
-from kornia_learnnorm.data.random_sets import RandomSets, StoreSets, SyntheticSets
-from kornia_learnnorm.data.sources import StoreSamples, SyntheticSamples
+from kornia_learnnorm.data.training_samples import StoreSamples, SyntheticSamples
+from kornia_learnnorm.data.training_sets import RandomSets, StoreSets, SyntheticSets
 from kornia_learnnorm.files import atomic_write, explained, short_name
 from lightning_modules.task import EstimatorTask, SetLoss
 

@@ -14,7 +14,7 @@ from pytorch_lightning.utilities import rank_zero_info
 from torch.utils.data import DataLoader
 
 from kornia_learnnorm.data.match_sets import MatchSets
-from kornia_learnnorm.data.sources import SEEDS_PER_RUN, BlockSource, block_generator
+from kornia_learnnorm.data.training_samples import SEEDS_PER_RUN, BlockSource, block_generator
 
 EVALUATION_SEED = 4_000_000_007  # far from the seeds of training epochs, below 2^32 as the generator needs it
 
@@ -135,7 +135,7 @@ class CorrespondenceDataModule(pl.LightningDataModule):
         val: source of the validation sets.
         test: source of the sets for test and predict.
         batch_size: sets in a batch; None for sources that draw whole batches, such as
-            :class:`~kornia_learnnorm.data.random_sets.RandomSets`.
+            :class:`~kornia_learnnorm.data.training_sets.RandomSets`.
         batch_pairs: image pairs in a training batch, each with all its samples; replaces ``batch_size`` there.
         seed: seed of the training draws; that of ``seed_everything`` when not given. Validation and test are drawn
             once, from a seed of their own.

@@ -9,8 +9,8 @@ import pytest
 
 from kornia_learnnorm import files
 from kornia_learnnorm.cli.main import main
+from kornia_learnnorm.data.store_writer import write_store
 from kornia_learnnorm.data.synthetic.scenes import synthetic_store
-from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.files import atomic_write, exclusive
 
 # Without the package, which takes seconds to import.

@@ -13,7 +13,7 @@ import torch
 from safetensors.torch import save_file
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.data.sources import Block, SyntheticSamples
+from kornia_learnnorm.data.training_samples import Block, SyntheticSamples
 from lightning_modules.callbacks import Checkpoints, WritePredictions
 from lightning_modules.datamodule import CorrespondenceDataModule
 from lightning_modules.task import EstimatorTask

@@ -13,7 +13,7 @@ from kornia_learnnorm.data.matching.workers import check_jobs
 from kornia_learnnorm.files import atomic_write, write_text
 from kornia_learnnorm.two_view import many_pairs
 from kornia_learnnorm.two_view.estimate_pair import estimate_pair
-from kornia_learnnorm.two_view.inputs import MODELS
+from kornia_learnnorm.two_view.input_checks import MODELS
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".pdf", ".svg")

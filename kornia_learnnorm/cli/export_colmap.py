@@ -12,11 +12,11 @@ from kornia_learnnorm.cli.match import add_matching_arguments, print_skipped
 from kornia_learnnorm.data import cameras, hloc
 from kornia_learnnorm.data.datasets.pairing import choose_pairs
 from kornia_learnnorm.data.datasets.reading import read_dataset
-from kornia_learnnorm.data.matching import match_store, workers
+from kornia_learnnorm.data.matching import frame_matching, workers
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.two_view.colmap_database import THRESHOLD, check_database, check_images, export_colmap
-from kornia_learnnorm.two_view.inputs import check_settings
+from kornia_learnnorm.two_view.input_checks import check_settings
 
 EXAMPLES = """\
 learnnorm export-colmap PHOTOS --out photos.db --single-camera
@@ -80,7 +80,7 @@ def _matches(args: argparse.Namespace, K: NDArray[np.float64] | None) -> Corresp
     check_images(args.root, [frame.name for frame in frames], K, args.single_camera)
     print(f"{len(frames)} images; {len(pairs)} pairs ({pairing})", file=sys.stderr)
     store = args.out.with_suffix(MATCHES)
-    options = match_store.MatchOptions(args.detector, args.num_features, args.matcher, max_matches=None)
+    options = frame_matching.MatchOptions(args.detector, args.num_features, args.matcher, max_matches=None)
     about = {"dataset": str(args.root), "pairs": pairing}
-    print_skipped(match_store.collect_matches(pairs, store, options, about, args.jobs, args.dask))
+    print_skipped(frame_matching.collect_matches(pairs, store, options, about, args.jobs, args.dask))
     return read_store(store)

@@ -11,9 +11,9 @@ from kornia_learnnorm.data.datasets.frames import resize_frames
 from kornia_learnnorm.data.datasets.pairing import choose_pairs
 from kornia_learnnorm.data.datasets.reading import DATASETS, missing_ground_truth, read_dataset
 from kornia_learnnorm.data.matching import features, matchers, workers
-from kornia_learnnorm.data.matching.match_store import MatchOptions, collect_matches
+from kornia_learnnorm.data.matching.frame_matching import MatchOptions, collect_matches
 from kornia_learnnorm.data.store import read_store
-from kornia_learnnorm.data.writer import check_target
+from kornia_learnnorm.data.store_writer import check_target
 
 EXAMPLES = """\
 learnnorm match folder PHOTOS --out photos.h5

@@ -3,9 +3,9 @@
 import argparse
 from pathlib import Path
 
+from kornia_learnnorm.data.store_writer import write_store
 from kornia_learnnorm.data.synthetic.render import render_pair, write_pair
 from kornia_learnnorm.data.synthetic.scenes import SCENES, synthetic_store
-from kornia_learnnorm.data.writer import write_store
 
 EXAMPLES = """\
 learnnorm synthesize folder

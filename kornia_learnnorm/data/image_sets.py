@@ -11,8 +11,8 @@ from torch import Generator, Tensor
 
 from kornia_learnnorm.data.images import Pixels, Size, image_size, read_image, reduced_size
 from kornia_learnnorm.data.match_sets import MatchSets
-from kornia_learnnorm.data.random_sets import StoreSets
-from kornia_learnnorm.data.sources import expand_path
+from kornia_learnnorm.data.training_samples import expand_path
+from kornia_learnnorm.data.training_sets import StoreSets
 from kornia_learnnorm.geometry.transforms import transform_points
 
 CACHED_IMAGES = 512  # in memory, in the size of the store

@@ -19,7 +19,7 @@ from kornia_learnnorm.geometry.distances import DISTANCE_SCALES, Distance, line_
 from kornia_learnnorm.geometry.dlt import design_matrix, null_space, solve_rows
 from kornia_learnnorm.geometry.matrices import inverse, nearest_rank2
 from kornia_learnnorm.geometry.problem import LinearProblem
-from kornia_learnnorm.geometry.rank2 import correct_rank2
+from kornia_learnnorm.geometry.rank2_correction import correct_rank2
 from kornia_learnnorm.geometry.seven_point import fundamental_in_span
 from kornia_learnnorm.models.two_view_model import TwoViewModel
 

@@ -20,7 +20,7 @@ from kornia_learnnorm.models.homography import Homography
 from kornia_learnnorm.models.two_view_model import TwoViewModel
 from kornia_learnnorm.normalizers.closed_form import Hartley
 from kornia_learnnorm.normalizers.normalizer import Normalizer, check_normalizer
-from kornia_learnnorm.ransac.arguments import check_matches, check_numbers
+from kornia_learnnorm.ransac.argument_checks import check_matches, check_numbers
 from kornia_learnnorm.ransac.fits import fit_final, optimize_locally
 from kornia_learnnorm.ransac.minimal_solver import solve_minimal_samples
 from kornia_learnnorm.ransac.samplers import Sampler, UniformSampler, WeightedSampler

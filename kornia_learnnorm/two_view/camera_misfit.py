@@ -15,7 +15,7 @@ from kornia_learnnorm.metrics.poses import pose_error
 from kornia_learnnorm.models.essential import Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.ransac.fits import LOSS_SCALE
-from kornia_learnnorm.two_view.inputs import Cameras
+from kornia_learnnorm.two_view.input_checks import Cameras
 from kornia_learnnorm.two_view.predicted_error import MEDIAN_SQUARE, MIN_NOISE
 
 NEAR_BENT, MAX_BENT = 3.0, 1000  # thresholds, and number; matches this near a matrix tell of a distortion

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from kornia_learnnorm.data.images import Size, image_size, stored_pixels
 from kornia_learnnorm.data.matching.workers import open_workers
 from kornia_learnnorm.data.store import CorrespondenceStore
-from kornia_learnnorm.data.writer import check_target
+from kornia_learnnorm.data.store_writer import check_target
 from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance, transfer_distance
@@ -27,7 +27,7 @@ from kornia_learnnorm.models.essential import nearest_essential
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import RATIO
 from kornia_learnnorm.ransac.ransac import RANSAC
-from kornia_learnnorm.two_view.inputs import check_settings, read_cameras
+from kornia_learnnorm.two_view.input_checks import check_settings, read_cameras
 from kornia_learnnorm.two_view.pair_warnings import (
     MAX_LOG_FALSE_ALARMS,
     PairWarning,

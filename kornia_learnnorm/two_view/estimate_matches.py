@@ -18,7 +18,14 @@ from kornia_learnnorm.protocol import INLIER_THRESHOLD
 from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.ransac.scoring import finite_and_bounded
 from kornia_learnnorm.two_view import predicted_error
-from kornia_learnnorm.two_view.inputs import Cameras, Points, check_settings, read_cameras, read_matches, read_size
+from kornia_learnnorm.two_view.input_checks import (
+    Cameras,
+    Points,
+    check_settings,
+    read_cameras,
+    read_matches,
+    read_size,
+)
 from kornia_learnnorm.two_view.model_choice import choose_model
 from kornia_learnnorm.two_view.pair_warnings import (
     CONTRADICTION,

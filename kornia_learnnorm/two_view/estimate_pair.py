@@ -18,7 +18,7 @@ from kornia_learnnorm.geometry.transforms import transform_fundamental, transfor
 from kornia_learnnorm.models.homography import Homography
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 from kornia_learnnorm.two_view.estimate_matches import estimate_matches
-from kornia_learnnorm.two_view.inputs import Points, check_number, check_settings, read_cameras
+from kornia_learnnorm.two_view.input_checks import Points, check_number, check_settings, read_cameras
 from kornia_learnnorm.two_view.repeated_texture import mutual_share, resolve_ambiguity
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 

@@ -25,7 +25,7 @@ from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.two_view.estimate_pair import MAX_SIZE, check_matching, estimate_pair
-from kornia_learnnorm.two_view.inputs import check_number, check_settings
+from kornia_learnnorm.two_view.input_checks import check_number, check_settings
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, package_versions
 
 RESULTS = "pairs.jsonl"  # one line a pair, in the order in which they are done

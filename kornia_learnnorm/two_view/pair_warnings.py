@@ -10,7 +10,7 @@ from kornia_learnnorm.data.images import Size
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.ransac.minimal_solver import spread_across
 from kornia_learnnorm.two_view.camera_misfit import camera_misfit, lens_misfit
-from kornia_learnnorm.two_view.inputs import Cameras
+from kornia_learnnorm.two_view.input_checks import Cameras
 
 MAX_ANGLE = 8.0  # degrees; a pose that moves by more in half of the parts is unstable
 MIN_INLIERS = 16  # with fewer, no estimate of the error is reliable either

@@ -21,7 +21,7 @@ from kornia_learnnorm.ransac.fits import LOSS_SCALE, fit_final
 from kornia_learnnorm.ransac.ransac import RANSAC, RansacResult
 from kornia_learnnorm.ransac.scoring import PairScorer
 from kornia_learnnorm.two_view import parallax
-from kornia_learnnorm.two_view.inputs import Cameras
+from kornia_learnnorm.two_view.input_checks import Cameras
 from kornia_learnnorm.two_view.pair_warnings import MAX_LOG_FALSE_ALARMS, log_false_alarms, log_false_samples
 from kornia_learnnorm.two_view.predicted_error import drop_failed_parts, random_parts
 from kornia_learnnorm.two_view.result import NoReliableMatrixError

@@ -11,8 +11,8 @@ import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.match_sets import draw_samples
 from kornia_learnnorm.data.store import read_store
+from kornia_learnnorm.data.store_writer import write_store
 from kornia_learnnorm.data.synthetic.scenes import synthetic_store
-from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.diagnostics import diagnose
 from kornia_learnnorm.evaluation.report.method_tables import report_tables
 from kornia_learnnorm.evaluation.runs.prediction_run import read_run

@@ -23,9 +23,9 @@ import kornia_learnnorm as kln
 from kornia_learnnorm.cli import synthesize
 from kornia_learnnorm.cli.main import TOOLS, TRAINING, main, make_parser
 from kornia_learnnorm.data.store import read_store
+from kornia_learnnorm.data.store_writer import write_store
 from kornia_learnnorm.data.synthetic.render import render_pair
 from kornia_learnnorm.data.synthetic.scenes import synthetic_store
-from kornia_learnnorm.data.writer import write_store
 from lightning_modules.config_files import find_config
 
 pytestmark = pytest.mark.usefixtures("program")
@@ -193,7 +193,7 @@ def test_synthesize(tmp_path, monkeypatch, refused):
 
 FIT = ["fit", "--config", "crossview-synthetic"]
 WITH_BAD = [*FIT, "--config", "bad.yaml"]
-DATA = "data: {{{}: {{class_path: kornia_learnnorm.data.sources.StoreSamples, init_args: {}}}}}"
+DATA = "data: {{{}: {{class_path: kornia_learnnorm.data.training_samples.StoreSamples, init_args: {}}}}}"
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from make_sequences import FR3
 
 from kornia_learnnorm.cli import match
 from kornia_learnnorm.cli.main import main
-from kornia_learnnorm.data.matching.match_store import collect_matches
+from kornia_learnnorm.data.matching.frame_matching import collect_matches
 from kornia_learnnorm.data.matching.matchers import one_to_one
 from kornia_learnnorm.data.store import read_store
 

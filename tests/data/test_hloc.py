@@ -7,7 +7,7 @@ from scenes import raises
 
 from kornia_learnnorm.data.hloc import read_hloc
 from kornia_learnnorm.data.store import read_store
-from kornia_learnnorm.data.writer import write_store
+from kornia_learnnorm.data.store_writer import write_store
 
 PAIR = "seq-a.png/b_1.png"
 KEYPOINTS = {"seq/a.png": [[1, 2], [3.5, 4], [5, 6]], "b_1.png": [[7, 8], [9, 10]], "unused.png": [[0, 0]]}

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scenes import raises, store_of
 
 from kornia_learnnorm.data.store import LAYOUT, CorrespondenceStore, StoreReader, read_store
-from kornia_learnnorm.data.writer import StoreWriter, write_store
+from kornia_learnnorm.data.store_writer import StoreWriter, write_store
 
 
 @pytest.fixture

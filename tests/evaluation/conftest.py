@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 
 from kornia_learnnorm.cli.main import main
+from kornia_learnnorm.data.store_writer import write_store
 from kornia_learnnorm.data.synthetic.scenes import synthetic_store
-from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.robust import robust_estimators
 
 METHODS = ["none", "Hartley", "whitening", "crossview", "Hartley+optimal", "Hartley+LM"]

@@ -6,8 +6,8 @@ import pytest
 import torch
 from train_processes import Pairs
 
-from kornia_learnnorm.data.random_sets import RandomSets, SyntheticSets
-from kornia_learnnorm.data.sources import Block, SyntheticSamples
+from kornia_learnnorm.data.training_samples import Block, SyntheticSamples
+from kornia_learnnorm.data.training_sets import RandomSets, SyntheticSets
 from lightning_modules.datamodule import BatchLoader, CorrespondenceDataModule
 
 

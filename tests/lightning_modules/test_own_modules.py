@@ -12,8 +12,8 @@ from scenes import correspondences, raises, rewrite_weights
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
+from kornia_learnnorm.data.store_writer import write_store
 from kornia_learnnorm.data.synthetic.scenes import synthetic_store
-from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.layer_export import load_layer
 
 PAGE = Path(__file__).parents[2] / "docs/own-modules.md"

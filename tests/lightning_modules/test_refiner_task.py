@@ -12,9 +12,9 @@ from scenes import raises, seeded, store_of
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.image_sets import ImageSets, find_images
-from kornia_learnnorm.data.random_sets import RandomSets, SyntheticSets
+from kornia_learnnorm.data.store_writer import write_store
 from kornia_learnnorm.data.synthetic.render import render_pair
-from kornia_learnnorm.data.writer import write_store
+from kornia_learnnorm.data.training_sets import RandomSets, SyntheticSets
 from lightning_modules.refiner_task import HeldOutLoss, RefinerTask, all_matches
 
 pytestmark = pytest.mark.usefixtures("program")

@@ -9,7 +9,7 @@ from lightning_fabric.plugins.io.torch_io import TorchCheckpointIO
 from scenes import raises
 from train_processes import SAMPLES, Blocks, Interrupt, Pairs, Stop, Watch, make_data, make_trainer, normaliser_task
 
-from kornia_learnnorm.data.random_sets import RandomSets, SyntheticSets
+from kornia_learnnorm.data.training_sets import RandomSets, SyntheticSets
 from lightning_modules.callbacks import AgainstStart, Checkpoints
 from lightning_modules.training_command import WholeCheckpoints
 

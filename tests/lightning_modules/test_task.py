@@ -7,9 +7,9 @@ from scenes import raises
 from train_processes import make_data, make_trainer, normaliser_task
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.data.random_sets import RandomSets, SyntheticSets
-from kornia_learnnorm.data.sources import SyntheticSamples, block_generator
 from kornia_learnnorm.data.synthetic.random_matches import random_matches, random_planes
+from kornia_learnnorm.data.training_samples import SyntheticSamples, block_generator
+from kornia_learnnorm.data.training_sets import RandomSets, SyntheticSets
 from lightning_modules.callbacks import ExportWeights, WritePredictions
 from lightning_modules.datamodule import EVALUATION_SEED, CorrespondenceDataModule
 from lightning_modules.task import EstimatorTask, Median, SetLoss

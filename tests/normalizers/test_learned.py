@@ -14,8 +14,8 @@ from torch import nn
 
 import kornia_learnnorm as kln
 from kornia_learnnorm import Hartley, LearnedNormalizer, Whitening, find_fundamental
-from kornia_learnnorm.data.random_sets import SyntheticSets
-from kornia_learnnorm.data.sources import block_generator
+from kornia_learnnorm.data.training_samples import block_generator
+from kornia_learnnorm.data.training_sets import SyntheticSets
 from kornia_learnnorm.geometry.transforms import paper_transform, spd_transform
 
 

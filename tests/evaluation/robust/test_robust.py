@@ -13,8 +13,8 @@ from scenes import raises, shaken_estimator
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.store import read_store
+from kornia_learnnorm.data.store_writer import write_store
 from kornia_learnnorm.data.synthetic.scenes import synthetic_store
-from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.robust import peers, robust_estimators
 from kornia_learnnorm.evaluation.robust.robust_estimators import DEFAULT_ESTIMATORS, find_estimator, run_estimator
 from kornia_learnnorm.evaluation.robust.robust_run import estimate_path, measure, read_robust, shuffled_pair

@@ -16,8 +16,8 @@ from references import epipolar_distances
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.match_sets import MatchSets
+from kornia_learnnorm.data.store_writer import write_store
 from kornia_learnnorm.data.synthetic.scenes import synthetic_store
-from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.methods import find_method
 from kornia_learnnorm.evaluation.runs import prediction_run
 from kornia_learnnorm.evaluation.runs.prediction_run import ERRORS, SampleOptions, consensus, predict, read_run

@@ -24,9 +24,9 @@ from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.datasets.frames import FramePair
 from kornia_learnnorm.data.datasets.pairing import pair_frames
 from kornia_learnnorm.data.datasets.reading import read_folder
-from kornia_learnnorm.data.matching import match_store
+from kornia_learnnorm.data.matching import frame_matching
 from kornia_learnnorm.data.matching.features import Features
-from kornia_learnnorm.data.matching.match_store import MatchOptions, collect_matches, match_frames
+from kornia_learnnorm.data.matching.frame_matching import MatchOptions, collect_matches, match_frames
 from kornia_learnnorm.data.store import LAYOUT, read_store
 
 OPTIONS = MatchOptions(num_features=200, max_matches=30)
@@ -71,7 +71,7 @@ def test_scores_of_lightglue_reach_the_store(images, tmp_path, cached_weights):
 
 
 def test_each_frame_is_detected_once_and_its_features_go(images, tmp_path, monkeypatch):
-    detect, waiting = match_store.DETECTORS["sift"], []
+    detect, waiting = frame_matching.DETECTORS["sift"], []
 
     def count(*arguments):
         waiting.append(len(list(tmp_path.glob("store.h5.parts/features-*/*.npz"))))
@@ -80,7 +80,7 @@ def test_each_frame_is_detected_once_and_its_features_go(images, tmp_path, monke
     frames = read_folder(images)
     pairs = [FramePair(a, b) for gap in (1, 2, 3) for a, b in zip(frames, frames[gap:], strict=False)]
     pairs.sort(key=lambda pair: pair.frame1.name)
-    monkeypatch.setitem(match_store.DETECTORS, "sift", count)
+    monkeypatch.setitem(frame_matching.DETECTORS, "sift", count)
     collect_matches(pairs, tmp_path / "store.h5", OPTIONS)
     assert (len(pairs), len(waiting)) == (30, 12)
     # A window of 8 pairs and the frames that reach 3 further: bounded, whatever the number of pairs.
@@ -107,14 +107,14 @@ def _a_worker_dies(tmp_path, monkeypatch):
     mark = tmp_path / "killed"
 
     def match(pair, features1, features2, options, place):
-        from kornia_learnnorm.data.matching.match_store import _match  # in the worker the original
+        from kornia_learnnorm.data.matching.frame_matching import _match  # in the worker the original
 
         if place == 3 and not mark.exists():
             mark.touch()
             os.kill(os.getpid(), signal.SIGKILL)
         return _match(pair, features1, features2, options, place)
 
-    monkeypatch.setattr(match_store, "_match", match)
+    monkeypatch.setattr(frame_matching, "_match", match)
     yield
     assert mark.exists()
 
@@ -124,7 +124,7 @@ class TestProcesses:
     @pytest.mark.usefixtures("_a_worker_dies")
     def test_a_killed_worker_and_ctrl_c_lose_nothing(self, images, expected, tmp_path, capfd, monkeypatch):
         """Ctrl-C reaches all processes of the command: the workers ignore it."""
-        out, parts, add = tmp_path / "store.h5", tmp_path / "store.h5.parts", match_store.StoreWriter.add
+        out, parts, add = tmp_path / "store.h5", tmp_path / "store.h5.parts", frame_matching.StoreWriter.add
 
         def add_and_interrupt(writer, place, pair):
             add(writer, place, pair)
@@ -136,7 +136,7 @@ class TestProcesses:
                 raise KeyboardInterrupt
 
         args = ["match", "folder", images, "--out", out, "--num-features", "200", "--max-matches", "30", "--jobs"]
-        monkeypatch.setattr(match_store.StoreWriter, "add", add_and_interrupt)
+        monkeypatch.setattr(frame_matching.StoreWriter, "add", add_and_interrupt)
         assert main([*map(str, args), "2"]) == 130
         monkeypatch.undo()
         error = capfd.readouterr().err
@@ -156,7 +156,7 @@ class TestProcesses:
             raise TerminatedWorkerError("killed")
             yield
 
-        monkeypatch.setattr(match_store, "_match_rest", broken)
+        monkeypatch.setattr(frame_matching, "_match_rest", broken)
         with pytest.raises(OSError, match=r"were killed 4 times in a row: killed"):
             collect_matches(pairs_of(images), tmp_path / "store.h5", OPTIONS)
 
@@ -186,9 +186,9 @@ class TestDask:
 @pytest.mark.parametrize(
     ("place", "error"),
     [
-        ("kornia_learnnorm.data.matching.match_store.StoreWriter.add", OSError(28, "No space left on device")),
-        ("kornia_learnnorm.data.matching.match_store.np.savez", OSError("1024 written of 000.png")),
-        ("kornia_learnnorm.data.matching.match_store.read_frame", KeyboardInterrupt()),
+        ("kornia_learnnorm.data.matching.frame_matching.StoreWriter.add", OSError(28, "No space left on device")),
+        ("kornia_learnnorm.data.matching.frame_matching.np.savez", OSError("1024 written of 000.png")),
+        ("kornia_learnnorm.data.matching.frame_matching.read_frame", KeyboardInterrupt()),
     ],
 )
 def test_after_an_error(images, expected, tmp_path, monkeypatch, place, error):

@@ -12,10 +12,10 @@ from torch import Generator, Tensor
 
 from kornia_learnnorm.data.images import Size
 from kornia_learnnorm.data.match_sets import MatchSets
-from kornia_learnnorm.data.sources import SEEDS_PER_RUN, Block, block_generator, check_draws, expand_path
 from kornia_learnnorm.data.store import CorrespondenceStore, MaxRatio, passes_ratio_test, read_store
 from kornia_learnnorm.data.synthetic.draws import log_uniform, normal, uniform
 from kornia_learnnorm.data.synthetic.random_matches import SyntheticMatches, random_matches
+from kornia_learnnorm.data.training_samples import SEEDS_PER_RUN, Block, block_generator, check_draws, expand_path
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.transforms import affine_transform, transform_points
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO

@@ -21,7 +21,7 @@ from kornia_learnnorm.data.matching.features import DETECTORS, READS_COLOUR, Fea
 from kornia_learnnorm.data.matching.matchers import check_methods, match_lightglue, match_nearest, one_to_one
 from kornia_learnnorm.data.matching.workers import Workers, open_workers
 from kornia_learnnorm.data.store import CorrespondenceStore, passes_ratio_test
-from kornia_learnnorm.data.writer import StoreWriter
+from kornia_learnnorm.data.store_writer import StoreWriter
 from kornia_learnnorm.files import exclusive
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import MAX_FILTERED, RATIO

@@ -10,12 +10,12 @@ from scenes import raises, seeded
 
 from kornia_learnnorm.data import match_sets
 from kornia_learnnorm.data.match_sets import draw_samples, plain_residual
-from kornia_learnnorm.data.random_sets import StoreSets
-from kornia_learnnorm.data.sources import Block, StoreSamples, SyntheticSamples, block_generator
 from kornia_learnnorm.data.store import read_store
+from kornia_learnnorm.data.store_writer import write_store
 from kornia_learnnorm.data.synthetic import handheld
 from kornia_learnnorm.data.synthetic.scenes import synthetic_store
-from kornia_learnnorm.data.writer import write_store
+from kornia_learnnorm.data.training_samples import Block, StoreSamples, SyntheticSamples, block_generator
+from kornia_learnnorm.data.training_sets import StoreSets
 
 
 @pytest.mark.parametrize("kind", [StoreSamples, StoreSets])

@@ -12,10 +12,10 @@ from scenes import raises, scenes, seeded
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.match_sets import MatchSets
-from kornia_learnnorm.data.random_sets import RandomSets, StoreSets, SyntheticSets, augment
+from kornia_learnnorm.data.store_writer import write_store
 from kornia_learnnorm.data.synthetic.random_matches import random_matches, random_planes, wide_baseline
 from kornia_learnnorm.data.synthetic.scenes import synthetic_store
-from kornia_learnnorm.data.writer import write_store
+from kornia_learnnorm.data.training_sets import RandomSets, StoreSets, SyntheticSets, augment
 
 
 def assert_equal(first: tuple, second: tuple) -> None:

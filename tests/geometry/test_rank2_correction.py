@@ -14,7 +14,7 @@ from kornia_learnnorm.estimators.robust_losses import Truncated, squared_loss
 from kornia_learnnorm.geometry.constrained_fit import constrained_fit
 from kornia_learnnorm.geometry.distances import DISTANCE_SCALES
 from kornia_learnnorm.geometry.matrices import nearest_rank2
-from kornia_learnnorm.geometry.rank2 import optimal_rank2
+from kornia_learnnorm.geometry.rank2_correction import optimal_rank2
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.ransac.scoring import PairScorer
 
