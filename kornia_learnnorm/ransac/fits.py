@@ -95,13 +95,11 @@ def _fit_on_manifold(scorer: PairScorer, M: Tensor, loss: Loss) -> Any:
         if float(gains[best].sum()) <= MIN_FRONT_GAIN * float(votes[best]):
             break  # no other one can have so many more
     state, weights = type(state)(*(value[best : best + 1] for value in state)), weights[best : best + 1]
-    losses = Truncated(scorer.threshold), loss
-    near, last = (scorer.cost(rho, weights=weights)._replace(relaxation=LM_RELAXATION) for rho in losses)
-    state = minimize(near, state, 1, TOLERANCE)[1].state
-    state = minimize(last, state, MAX_LM_STEPS, TOLERANCE)[1].state
+    cost = scorer.cost(loss, weights=weights)._replace(relaxation=LM_RELAXATION)
+    state = minimize(cost, state, MAX_LM_STEPS, TOLERANCE)[1].state
     square_scale = weights.new_full((1, 1), (LOSS_SCALE * scorer.threshold) ** 2)
     if evidence is None or not bool(contradict_cameras(evidence, state, weights, square_scale)):
         return state
-    free = minimize(last, Fundamental().state(state.matrix()), MAX_LM_STEPS, TOLERANCE)[1].state
+    free = minimize(cost, Fundamental().state(state.matrix()), MAX_LM_STEPS, TOLERANCE)[1].state
     pose: Any = model.state(free.matrix())
     return free if bool(keeps_fit(evidence, state, pose, weights, square_scale.clamp(min=POSE_PIXELS**2))) else state

@@ -14,7 +14,7 @@ from kornia_learnnorm.geometry.distances import Distance
 from kornia_learnnorm.geometry.distinct_points import distinct_points
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem
-from kornia_learnnorm.models.essential import Essential
+from kornia_learnnorm.models.essential import Calibrated, Essential
 from kornia_learnnorm.models.fundamental import Fundamental, Rank2Method
 from kornia_learnnorm.models.homography import Homography
 from kornia_learnnorm.models.two_view_model import TwoViewModel
@@ -254,8 +254,10 @@ class RANSAC(nn.Module):
             return _failure(points1, drawn, cameras)
         score = float((1 - (distances / self.inl_th).square()).clamp(min=0).nansum())
         F_mat = unit_matrix(scorer.to_pixels(F)[0]).to(points1.dtype)
-        model = scorer.model
-        E_mat = model.state(F).essential()[0].to(points1.dtype) if isinstance(model, Essential) else None
+        E_mat = None
+        if isinstance(scorer.model, Essential):
+            pose = state if isinstance(state, Calibrated) else scorer.model.state(F)
+            E_mat = pose.essential()[0].to(points1.dtype)
         return RansacResult(F_mat, inliers, drawn, score, E_mat)
 
     def _search(self, scorer: PairScorer, sampler: Sampler, generator: torch.Generator) -> tuple[Hypotheses, int]:
