@@ -11,7 +11,8 @@ from kornia_learnnorm.models.essential import Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.models.homography import Homography
 from kornia_learnnorm.two_view.parallax import measure_parallax
-from kornia_learnnorm.two_view.predicted_error import MEDIAN_SQUARE, MIN_NOISE, MIN_SUPPORT
+from kornia_learnnorm.two_view.predicted_error import MEDIAN_SQUARE, MIN_NOISE
+from kornia_learnnorm.two_view.random_parts import MIN_SUPPORT
 from kornia_learnnorm.two_view.result import ModelChoice, NoReliableMatrixError
 from kornia_learnnorm.two_view.solver import MIN_MATCHES, Solution, TwoViewSolver
 

@@ -14,10 +14,6 @@ from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.metrics.poses import pose_error
 from kornia_learnnorm.two_view.parallax import parallax
 
-NUM_PARTS = 12  # random parts of the matches that are solved again
-PART_INLIERS = 48  # expected in a part, where these are more than half and less than four fifths of all inliers
-MIN_SUPPORT = 0.75  # of the inliers; the matrix of a part with fewer is that of a search that failed
-MIN_SOLVED_PARTS = 4  # with fewer matrices of as much support, those of all parts count
 NOMINAL_FOCAL = 1.2  # of the longer image side: focal length where no camera is given
 COMMON_ERRORS = 400  # matches beyond which more do not help: the errors of neighbours are alike
 MEDIAN_SQUARE = 0.455  # of a standard normal variable
@@ -30,20 +26,6 @@ class PredictedError(NamedTuple):
 
     distance: float  # median symmetric epipolar distance, or distance in image 2 of points moved by H, pixels
     angle: float  # larger angle of the rotations and of the directions of translation, degrees
-
-
-def random_parts(number: int, inliers: int, seed: int) -> Tensor:
-    """Return the rows (P, M) of random subsets: half of the matches, or so many that 48 inliers are expected."""
-    share = min(max(0.5, PART_INLIERS / max(1, inliers)), 0.8)
-    size = min(max(8, round(share * number)), number - 1)
-    generator = torch.Generator().manual_seed(seed)
-    return torch.stack([torch.randperm(number, generator=generator)[:size] for _ in range(NUM_PARTS)])
-
-
-def drop_failed_parts(F_parts: Tensor, support: Tensor, inliers: int) -> Tensor:
-    """Return the matrices of parts (P, 3, 3) whose support (P,) is most inliers; all of them where these are few."""
-    solved = support >= MIN_SUPPORT * inliers
-    return F_parts[solved] if int(solved.sum()) >= MIN_SOLVED_PARTS else F_parts
 
 
 def predict_error(

@@ -22,8 +22,8 @@ from kornia_learnnorm.ransac.ransac import RANSAC, RansacResult
 from kornia_learnnorm.ransac.scoring import PairScorer
 from kornia_learnnorm.two_view import parallax
 from kornia_learnnorm.two_view.input_checks import Cameras
-from kornia_learnnorm.two_view.pair_warnings import MAX_LOG_FALSE_ALARMS, log_false_alarms, log_false_samples
-from kornia_learnnorm.two_view.predicted_error import drop_failed_parts, random_parts
+from kornia_learnnorm.two_view.pair_warnings import MAX_LOG_FALSE_ALARMS, log_false_alarms
+from kornia_learnnorm.two_view.random_parts import are_in_vain, draw_parts, drop_failed_parts
 from kornia_learnnorm.two_view.result import NoReliableMatrixError
 
 Model = Literal["fundamental", "homography"]
@@ -39,9 +39,6 @@ PART_SAMPLES = 5_000  # of five matches of a part: where a quarter are inliers, 
 FREE_SHARE = 0.8  # of the inliers without cameras, which right cameras exceed
 MISSED = 1e-4  # probability that no sample is free of outliers
 MIN_LOSS_SCALE = 1e-3  # thresholds; of the loss for matches without noise
-FEW_MATCHES = 400  # so few determine a matrix only with more inliers than RANSAC misses again and again
-MAX_FAILED_PARTS = 6  # parts of few matches that are no better than chance, as all matches, before the search ends
-MAX_EMPTY_PARTS = 2  # parts with no more inliers than a search among random matches finds, before the search ends
 
 
 class Solution(NamedTuple):
@@ -69,7 +66,7 @@ class TwoViewSolver:
     def search(self, first: Solution, size2: Size) -> Solution:
         """Return the best matrix of :meth:`solve` and random parts; raise NoReliableMatrixError for few inliers."""
         F_mat, weights = first.matrix, first.weights
-        parts = random_parts(len(weights), int(self.support(F_mat)), self.seed)
+        parts = draw_parts(len(weights), int(self.support(F_mat)), self.seed)
         F_parts = self._solve_parts(F_mat, parts, size2)
         F_mat = self.improve(F_mat, F_parts)
         agree = int(self.support(F_mat))
@@ -90,7 +87,7 @@ class TwoViewSolver:
         distance = self.distance(H_mat, "homography")
         inliers, near = distance < self.threshold, distance < NEAR * self.threshold
         agree = int(inliers.sum())
-        parts = random_parts(len(inliers), agree, self.seed)
+        parts = draw_parts(len(inliers), agree, self.seed)
         solvers = [self.part(rows[near[rows]]) for rows in parts if int(near[rows].sum()) >= Homography.min_points]
         H_parts = torch.stack([solver._ransac("homography").F_mat for solver in solvers])  # noqa: SLF001 (its own class)
         solved = drop_failed_parts(H_parts, self.support(H_parts, "homography"), agree)
@@ -180,16 +177,12 @@ class TwoViewSolver:
         return ransac.estimate(self.points1, self.points2, self.scores.clamp(min=MIN_SCORE), *cameras)
 
     def _solve_parts(self, F_mat: Tensor, parts: Tensor, size2: Size) -> Tensor:
-        """Return the matrices of the parts; of few matches, only of the first where these find no more than chance."""
+        """Return the matrices of the parts, only of the first where these are in vain."""
         found = F_mat[None]
         solver = replace(self, max_samples=min(self.max_samples, PART_SAMPLES))
         for tried, rows in enumerate(parts, 1):
             found = torch.cat([found, solver.part(rows).solve().matrix[None]])
-            if len(self.scores) > FEW_MATCHES:  # a late part can find what all others missed
-                continue
-            about = len(self.scores), int(self.support(found).max()), self.threshold, size2
-            empty = tried == MAX_EMPTY_PARTS and log_false_samples(*about) > 0
-            if empty or (tried == MAX_FAILED_PARTS and log_false_alarms(*about) > MAX_LOG_FALSE_ALARMS):
+            if are_in_vain(tried, len(self.scores), int(self.support(found).max()), self.threshold, size2):
                 break
         return found[1:]
 

@@ -14,7 +14,7 @@ import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld
 from kornia_learnnorm.data.synthetic.random_matches import random_planes
 from kornia_learnnorm.metrics.poses import pose_error
-from kornia_learnnorm.two_view import pair_warnings, predicted_error
+from kornia_learnnorm.two_view import pair_warnings, predicted_error, random_parts
 from kornia_learnnorm.two_view.camera_misfit import camera_misfit, lens_misfit
 from kornia_learnnorm.two_view.pair_warnings import drop_contradiction, find_warnings, log_false_alarms
 from kornia_learnnorm.two_view.solver import TwoViewSolver
@@ -24,9 +24,9 @@ def test_failed_searches_do_not_count():
     """Of 100 inliers, a matrix of a part must have 75; with fewer than four such matrices all count."""
     F_parts = torch.eye(3).double() * torch.arange(1.0, 7.0)[:, None, None]
     support = torch.tensor([110, 75, 74, 20, 90, 80])
-    assert predicted_error.drop_failed_parts(F_parts, support, 100)[:, 0, 0].tolist() == [1, 2, 5, 6]
-    assert len(predicted_error.drop_failed_parts(F_parts, support, 101)) == 6
-    assert torch.equal(predicted_error.drop_failed_parts(F_parts, support, 10), F_parts)
+    assert random_parts.drop_failed_parts(F_parts, support, 100)[:, 0, 0].tolist() == [1, 2, 5, 6]
+    assert len(random_parts.drop_failed_parts(F_parts, support, 101)) == 6
+    assert torch.equal(random_parts.drop_failed_parts(F_parts, support, 10), F_parts)
 
 
 @pytest.mark.parametrize("number", [40, 200])
@@ -36,7 +36,7 @@ def test_predicted_error_is_near_the_true_one(number):
     exact = handheld(24, number + 200, generator, noise=0.0)
     noise = 0.5 * torch.randn(24, number, 4, generator=generator, dtype=torch.float64)
     x1, x2 = exact.points1[:, :number] + noise[..., :2], exact.points2[:, :number] + noise[..., 2:]
-    rows = predicted_error.random_parts(number, number, 0)
+    rows = random_parts.draw_parts(number, number, 0)
 
     def solve(points1, points2):
         return kln.refine_fundamental(points1, points2, kln.find_fundamental(points1, points2)).F_mat
@@ -108,7 +108,7 @@ def test_of_homographies(number):
     truth, H_true = exact.exact1, kln.find_homography(exact.exact1, exact.exact2)
     noise = 0.5 * torch.randn(24, number, 4, generator=generator, dtype=torch.float64)
     x1, x2 = exact.exact1[:, :number] + noise[..., :2], exact.exact2[:, :number] + noise[..., 2:]
-    rows = predicted_error.random_parts(number, number, 0)
+    rows = random_parts.draw_parts(number, number, 0)
     H_mat = kln.find_homography(x1, x2)
     H_parts = kln.find_homography(x1[:, rows].flatten(0, 1), x2[:, rows].flatten(0, 1)).unflatten(0, (24, -1))
     found = [
