@@ -8,6 +8,8 @@ __all__ = ["main"]
 def main() -> int:
     """Run the command line and return its exit code, 130 also where Ctrl-C comes while modules are imported."""
     try:
+        import numpy  # noqa: F401  # first: imported by torch, it would swallow Ctrl-C
+
         from kornia_learnnorm.cli.main import main as run
 
         return run()

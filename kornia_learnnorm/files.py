@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-FULL_DISK = (errno.ENOSPC, errno.EDQUOT)  # error numbers
+FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # error numbers
 
 
 @contextmanager

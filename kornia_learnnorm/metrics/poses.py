@@ -31,8 +31,8 @@ def pose_error(R: Tensor, t: Tensor, R_true: Tensor, t_true: Tensor) -> Tensor:
     """
     for value, shape in ((R, "33"), (R_true, "33"), (t, "3"), (t_true, "3")):
         KORNIA_CHECK_SHAPE(value, ["*", *shape])
-    R, t = R.expand_as(R + R_true), t.expand_as(t + t_true)  # Kornia's functions take equal shapes
-    R_true, t_true = R_true.expand_as(R), t_true.expand_as(t)
+    R, t = R.expand_as(R + R_true), t.expand_as(t + t_true)  # Kornia's functions take equal shapes and dtypes
+    R_true, t_true = R_true.expand_as(R).to(R), t_true.expand_as(t).to(t)
     error = torch.maximum(angle_error_mat(R, R_true), angle_error_vec(t, t_true))
     unknown = (angle_error_mat(R_true, R_true) + angle_error_vec(t_true, t_true)).isnan()
     return torch.where(unknown, torch.nan, error.nan_to_num(nan=inf))

@@ -19,7 +19,7 @@ from kornia_learnnorm.data.matching.workers import open_workers
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.data.store_writer import check_target
 from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
-from kornia_learnnorm.files import atomic_write
+from kornia_learnnorm.files import atomic_write, explained
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance, transfer_distance
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.geometry.transforms import transform_fundamental
@@ -128,11 +128,13 @@ def export_colmap(
         matrix, (points1, points2) = torch.from_numpy(camera), map(torch.from_numpy, pairs[0].points)
         doubts = find_camera_doubt((matrix, matrix), pairs[0].sizes, points1, points2, None, threshold)
     with atomic_write(path) as temporary:
-        ids = _write_images(pycolmap, temporary, images, pairs, camera, single_camera)
+        with explained(f"COLMAP cannot write {path}", RuntimeError):
+            ids = _write_images(pycolmap, temporary, images, pairs, camera, single_camera)
         arguments = ((pair, layer, threshold, seed, camera) for pair in pairs)
         with open_workers(jobs) as workers, workers.results(_estimate, arguments) as results:
             found = [*tqdm(results, "estimating", len(pairs), unit="pair", file=sys.stderr)]
-        _write_pairs(pycolmap, temporary, ids, pairs, found)
+        with explained(f"COLMAP cannot write {path}", RuntimeError):
+            _write_pairs(pycolmap, temporary, ids, pairs, found)
     verified = [(pair, geometry) for pair, geometry in zip(pairs, found, strict=True) if geometry is not None]
     unverified = tuple(sorted(ids.keys() - {name for pair, _ in verified for name in pair.names}))
     number, inliers = sum(len(pair.scores) for pair in pairs), sum(int(part.inliers.sum()) for _, part in verified)

@@ -14,6 +14,7 @@ from kornia_learnnorm.geometry.checks import check_cameras, check_choice
 
 MODELS = ("auto", "fundamental", "homography")
 MAX_THRESHOLD = 1000.0  # pixels
+MAX_FOCAL = 1e9  # pixels; poses of far longer ones are rounding
 MIN_INSIDE = 0.8  # of the points of an image
 FAR = 3.0  # times what nine of ten coordinates stay below; a farther point says nothing of its image's size
 Points = Tensor | NDArray[Any]
@@ -40,13 +41,14 @@ def read_matches(points1: Points, points2: Points, scores: Points | None) -> tup
 def read_cameras(K1: Points | None, K2: Points | None) -> Cameras | None:
     """Return the cameras (3, 3) of both images in float64, or None where none is given.
 
-    Errors are those of ``check_cameras``, and a ValueError for a focal length that is not positive.
+    Errors are those of ``check_cameras``, and a ValueError for a focal length that is not positive, or above 1e9 px.
     """
     camera1, camera2 = (None if K is None else _as_float64(name, K) for name, K in (("K1", K1), ("K2", K2)))
     check_cameras(camera1, camera2)
     for name, camera in (("K1", camera1), ("K2", camera2)):
-        if camera is not None and not bool((camera.diagonal()[:2] > 0).all()):
-            raise ValueError(f"{name} must have positive focal lengths, got {camera.diagonal()[:2].tolist()}")
+        focal = torch.ones(2) if camera is None else camera.diagonal()[:2] / camera[2, 2]
+        if not bool(((focal > 0) & (focal <= MAX_FOCAL)).all()):
+            raise ValueError(f"{name} must have positive focal lengths of at most 1e9 px, got {focal.tolist()}")
     return None if camera1 is None or camera2 is None else (camera1, camera2)
 
 

@@ -29,7 +29,7 @@ from kornia_learnnorm.two_view.input_checks import check_number, check_settings
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, package_versions
 
 RESULTS = "pairs.jsonl"  # one line a pair, in the order in which they are done
-TABLE = "pairs.csv"  # the same without the matches, in the order of the pairs
+TABLE = "pairs.csv"  # the same without the matches; the pairs of the last run come first, in their order
 COLUMNS = ("model", "num_matches", "num_inliers", "predicted_error_px", "F", "H", "E", "R", "t", "n")  # of the table
 OPTIONS = "options.json"
 MAX_PASSES = 100  # of MatchRefiner, which takes a few
@@ -141,7 +141,7 @@ def estimate_pairs(
                 file.write(json.dumps(line, allow_nan=False) + "\n")
                 file.flush()
                 done[pair] = line
-        _write_table(folder / TABLE, [done[pair] for pair in pairs])
+        _write_table(folder / TABLE, [done[pair] for pair in dict.fromkeys([*pairs, *done])])
     return [done[pair] for pair in pairs]
 
 

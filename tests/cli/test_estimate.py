@@ -146,8 +146,7 @@ class TestManyPairs:
         lines = [json.loads(line) for line in first.splitlines()]
         assert [[warning["code"] for warning in line["warnings"]] for line in lines] == [[], ["unreadable"]]
         assert np.allclose(lines[0]["F"], result.F_mat)
-        assert lines[1]["F"] is None
-        assert lines[1]["versions"] == lines[0]["versions"]
+        assert (lines[1]["F"], lines[1]["versions"]) == (None, lines[0]["versions"])
         with pytest.raises(ValueError, match=r"results of other options, write elsewhere: ratio \S+, now 0\.7$"):
             command(*options, "--ratio", "0.7", images=())
         path.write_text(first + '{"F": nu')  # as a killed run leaves it
@@ -169,13 +168,15 @@ class TestManyPairs:
             shutil.copy(planes / f"{source}.png", f"photos/{name}.png")
         assert command("--pairs", "photos", "--out", "found", "--jobs", "1", *options, images=()) == 3
         lines = [json.loads(line) for line in Path("found/pairs.jsonl").read_text().splitlines()]
-        with Path("found/pairs.csv").open() as file:
-            rows = [*csv.DictReader(file)]
+        rows = [*csv.DictReader(Path("found/pairs.csv").read_text().splitlines())]
         assert len(rows) == len(lines) == pairs
         for row, line in zip(rows, lines, strict=True):
             assert row["image1"] == line["image1"]["file"]
             assert row["F"].split() == ([str(value) for value in np.ravel(line["F"])] if line["F"] else [])
             assert row["warnings"].split() == [warning["code"] for warning in line["warnings"]]
+        assert command("--pairs", "photos", "--out", "found", "--jobs", "1", "--gap", "2", images=()) == 3
+        table, lines = (Path(f"found/pairs.{suffix}").read_text().splitlines() for suffix in ("csv", "jsonl"))
+        assert len(table) == 1 + len(lines)  # pairs of the first run that the second has not, too
 
     def test_lists(self, tmp_path):
         path = tmp_path / "list.txt"

@@ -36,7 +36,7 @@ class TestPoseError:
 
     def test_smoke(self, device, dtype):
         R, t = torch.eye(3, device=device, dtype=dtype).repeat(2, 5, 1, 1), torch.rand(2, 5, 3, device=device).to(dtype)
-        found = pose_error(R, t, R[0, 0], t)
+        found = pose_error(R, t, R[0, 0].double(), t.double())
         assert (found.shape, found.dtype, found.device.type) == ((2, 5), dtype, device.type)
         assert (found < 1e-3).all()
 
