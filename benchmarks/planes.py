@@ -10,7 +10,7 @@ homography explains at least half of the inliers of a fundamental matrix, both b
 a pair's matches gives the homography; the error is the transfer distance of the other half, outliers too. Each half
 gives one, twice.
 
-    python benchmarks/planes.py [--sizes 16 64 256 512] [--outliers 0.1 0.5 0.8] [--sets 128] [--rotated 0] [--csv FILE]
+    python benchmarks/planes.py [--sizes 16 64 256 512] [--outliers 0.1 0.5 0.8] [--sets 512] [--rotated 0] [--csv FILE]
     python benchmarks/planes.py --photographs $LEARNNORM_DATA/correspondences/photos.h5 [--csv FILE]
 
 With --rotated 180 image 2 is upside down. What is not installed is left out.
@@ -198,7 +198,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = make_parser(__doc__, csv="write all tables to this file")
     parser.add_argument("--sizes", type=int, nargs="+", default=[16, 64, 256, 512])
     parser.add_argument("--outliers", type=float, nargs="+", default=[0.1, 0.5, 0.8])
-    parser.add_argument("--sets", type=int, default=128)
+    parser.add_argument("--sets", type=int, default=512)
     parser.add_argument("--rotated", type=float, default=0.0, help="image 2 in its plane, degrees")
     parser.add_argument("--photographs", type=Path, help="a store of matches")
     args = parser.parse_args(arguments)

@@ -127,6 +127,7 @@ class AgainstStart(Callback):
 
     def __init__(self) -> None:
         self.start: dict[str, float] = {}  # errors before the first step; empty where they were not measured
+        self.batches: Any = None  # of the validation then
         self.last: dict[str, float] = {}  # errors of the last validation
         self.step = 0  # steps before the last validation
 
@@ -136,8 +137,9 @@ class AgainstStart(Callback):
         errors = {name: float(value) for name, value in trainer.callback_metrics.items() if name in names}
         if not trainer.sanity_checking:
             self.last, self.step = errors, trainer.global_step
+            self.start = self.start if self.batches == trainer.num_val_batches else {}
         elif trainer.global_step == 0 and trainer.num_sanity_val_steps == float("inf"):
-            self.start = errors
+            self.start, self.batches = errors, trainer.num_sanity_val_batches
 
     def summary(self) -> str:
         """Return whether the last errors are below those at the start, and all of them."""
@@ -152,11 +154,11 @@ class AgainstStart(Callback):
 
     def state_dict(self) -> dict[str, Any]:
         """Return what a resumed training needs."""
-        return {"start": self.start}
+        return {"start": self.start, "batches": self.batches}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Take the errors at the start of the training that is resumed."""
-        self.start = state_dict["start"]
+        self.start, self.batches = state_dict["start"], state_dict.get("batches")
 
 
 def _print_above_bar(text: str) -> None:
@@ -215,7 +217,7 @@ def _try_out(normalizer: LearnedNormalizer, loss: Any, num_heldout: int) -> None
         if not isinstance(value, Tensor):
             raise TypeError(f"the loss must return a tensor, got {type(value).__name__}")
         if not num_heldout and bool(value.isnan().any()):
-            raise ValueError("the loss is NaN without held-out points: set num_heldout of the data")
+            raise ValueError("the loss is NaN: does it need held-out points, num_heldout of the data?")
     except Exception as error:  # code that is not this package's can raise anything
         text = " ".join(str(error).split())
         hint = ": register its tensors as buffers" if " meta " in text else ""

@@ -304,13 +304,20 @@ def cameras_of(batch: MatchSets) -> tuple[Tensor, Tensor]:
 
 
 class OneCycle(OneCycleLR):
-    """PyTorch's schedule, which goes on only in a training of as many steps: elsewhere it fails, or ends too early."""
+    """PyTorch's schedule, which goes on only in a training of as many steps and the same rate.
+
+    Elsewhere it fails, ends too early, or ignores the new rate.
+    """
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Load the state of a checkpoint, which must be of a training of as many steps."""
-        if state_dict["total_steps"] != self.total_steps:
-            had = f"the checkpoint is of a training of {state_dict['total_steps']} steps, one cycle of learning rates"
-            raise ValueError(f"{had}; got {self.total_steps} steps: keep the number, or begin a new run elsewhere")
+        """Load the state of a checkpoint, which must be of a training of as many steps and the same rate."""
+        had, now = (
+            f"{found['total_steps']} steps from a learning rate of {found['base_lrs'][0]:.4g}"
+            for found in (state_dict, vars(self))
+        )
+        if had != now:
+            text = f"the checkpoint is of a training of {had}, one cycle of learning rates"
+            raise ValueError(f"{text}; got {now}: keep both, or begin a new run elsewhere")
         super().load_state_dict(state_dict)
 
 

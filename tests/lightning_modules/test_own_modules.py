@@ -154,7 +154,7 @@ def test_what_fails_in_training_is_named(run, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(run)
     for option, message in [
         (f"{NETWORK}=broken_modules.Single", "must return (params1, params2), got <class 'torch.Tensor'>"),
-        ("--model.loss=broken_modules.Held", "ValueError: the loss is NaN without held-out points: set num_heldout"),
+        ("--model.loss=broken_modules.Held", "ValueError: the loss is NaN: does it need held-out points, num_heldout"),
         (f"{NETWORK}=broken_modules.Flat", "params1 and params2 must have shape (B, P), got [[5], [5]]"),
         ("--model.loss=broken_modules.Broken", "20 steps in a row were skipped: no samples, or no finite gradient"),
         ("--model.loss=broken_modules.ThreeSets", "sets, got [3]"),

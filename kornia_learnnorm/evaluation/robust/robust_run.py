@@ -1,7 +1,6 @@
 """Results of robust estimators on stores, kept in a folder: what ``learnnorm robust`` makes."""
 
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -64,10 +63,14 @@ def record_robust(
     if unknown := {*redo} - {*estimators}:
         raise ValueError(f"--redo {' '.join(sorted(unknown))}: not among the estimators of this command")
     names = robust_estimators.estimator_names(estimators)
-    installed: dict[str, Estimator] = {}
+    installed, absent = dict[str, Estimator](), list[ImportError]()
     for name, short in names.items():
-        with suppress(ImportError):  # its package is not installed
+        try:
             installed[short] = robust_estimators.find_estimator(name)
+        except ImportError as error:  # its package is not installed
+            absent.append(error)
+    if absent and not installed:
+        raise absent[0]
     identify = robust_estimators.identify_estimator
     identities = {short: identify(name) if short in installed else None for name, short in names.items()}
     read = {name: read_store(path) for name, path in stores.items()}
