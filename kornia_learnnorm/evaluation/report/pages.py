@@ -19,6 +19,7 @@ from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import RATIO
 
 GREY = "#808890"  # lines and letters of a picture in its own file: legible on white and on black
+NO_TERMINAL = 1000  # columns where the output goes to a file
 INTERVALS = (
     f"Filtered matches: the nearest descriptor is less than {RATIO:g} times as far as the second nearest. In brackets "
     f"are 95 % bootstrap intervals over image pairs, of 2,000 resamples; fewer than {MIN_BOOTSTRAP_PAIRS} pairs have "
@@ -134,7 +135,7 @@ def _anchor(title: str) -> str:
 
 def print_tables(tables: Sequence[Table], elsewhere: Path) -> None:
     """Print the tables that fit the terminal, and the titles of those that do not, which are in ``elsewhere``."""
-    columns, wide = shutil.get_terminal_size().columns, []
+    columns, wide = shutil.get_terminal_size((NO_TERMINAL, 24)).columns, []
     for table in tables:
         grids = (_grid(table, narrow) for narrow in (False, True))
         grid = next((text for text in grids if len(text.partition("\n")[0]) <= columns), None)
