@@ -150,7 +150,8 @@ class LearnedHomography(LearnedLayer):
     order of the correspondences has no effect. Swapping the views gives :math:`H^{-1}` up to scale. :math:`H` is
     equivariant to a translation and a scale that are common to both images.
 
-    Do not use it on scenes with relief: it returns the homography that most matches agree on, without a warning.
+    Do not use it on scenes with relief: it returns the homography that most matches agree on, without a warning. What
+    :class:`~kornia_learnnorm.LearnedEightPoint` says of rotated images holds here too.
 
     Args:
         width: channels of the networks.
