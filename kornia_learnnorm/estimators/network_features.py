@@ -17,6 +17,7 @@ from kornia_learnnorm.models.two_view_model import TwoViewModel
 POINT_FEATURES, RESIDUAL_FEATURES = 9, 5  # numbers of a correspondence
 RESIDUAL_FLOOR = 1e-5  # of the frame's unit, added to distances before their logarithm
 DEVIATION_FLOOR = 1e-5  # of the frame's unit: the rounding of an exact shift of the image says nothing
+MIN_SQUARE = 1e-200  # of lengths: the second derivative of a root at zero is not finite
 MIN_PROBABILITY = 1e-3  # added to the probabilities of inliers in a mean
 FAR_FROM_CHANCE = 1.5  # correlations of rotated views, in root mean squares of those of random matches
 
@@ -40,8 +41,9 @@ class CommonFrame(NamedTuple):
         share = None if present is None else (present / safe_divisor(present.sum(-1, keepdim=True)))[:, None]
         mean = points.mean(2) if share is None else (points * share[..., None]).sum(2)
         origin = mean.mean(1)
-        from_origin, from_mean = (points - origin[:, None, None]).norm(dim=-1), (points - mean[:, :, None]).norm(dim=-1)
-        distances = torch.stack([from_origin, from_mean])
+        centred = points - origin[:, None, None]
+        squares = torch.stack([centred, points - mean[:, :, None]]).square().sum(-1)
+        distances = squares.clamp(min=MIN_SQUARE).sqrt()
         distances = distances.mean(-1) if share is None else (distances * share).sum(-1)
         radius = distances[0].mean(1)
         radius = radius + (radius == 0)
@@ -50,7 +52,7 @@ class CommonFrame(NamedTuple):
         entries = [one / radius, zero, -x / radius, zero, one / radius, -y / radius, zero, zero, one]
         inverse = [radius, zero, x, zero, radius, y, zero, zero, one]
         T, back = torch.unflatten(torch.stack([torch.stack(entries, -1), torch.stack(inverse, -1)]), -1, (3, 3))
-        x1, x2 = ((points - origin[:, None, None]) / radius[:, None, None, None]).unbind(1)
+        x1, x2 = (centred / radius[:, None, None, None]).unbind(1)
         return cls(x1, x2, T, back, distances[1, :, 0].detach() > distances[1, :, 1].detach())
 
 
@@ -87,7 +89,8 @@ def match_features(frame: CommonFrame, upright: Tensor, scores: Tensor | None, p
     second = second + (second - centre) @ (upright[:, :2, :2].mT - torch.eye(2).to(upright))
     shift = second - first
     shift = shift - masked_median(shift, present)
-    deviation = masked_median(shift.norm(dim=-1, keepdim=True), present)
+    length = shift.square().sum(-1, keepdim=True).clamp(min=MIN_SQUARE).sqrt()
+    deviation = masked_median(length, present)
     relative = torch.asinh(shift / deviation.clamp(min=DEVIATION_FLOOR))
     if scores is None:
         score = torch.zeros_like(relative)

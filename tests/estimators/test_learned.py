@@ -281,6 +281,15 @@ def test_gradients(kind, scene, number, options):
     check_gradients(numbers, points1, points2, uniform(*points1.shape[:2]), rtol=1e-2, **tolerances)
 
 
+@every
+def test_second_derivatives_are_finite(kind):
+    """In some of the sets a match has the median shift in both coordinates."""
+    points1, *others = inputs(kind, 16, 9)
+    matrices = signless(LAYERS[kind]()(points1.requires_grad_(), *others))
+    (gradient,) = torch.autograd.grad(matrices.sum(), points1, create_graph=True)
+    assert torch.autograd.grad(gradient.square().sum(), points1)[0].isfinite().all()
+
+
 @pytest.mark.parametrize(
     ("kind", "number", "options"),
     [
