@@ -34,6 +34,8 @@ NEAR, EARLY_NEAR_SCALE, LAST_NEAR_SCALE, SETTLED_SCALE = 3.0, 4.2, 1.0, 4.4
 SCALE_BOUND = 1.5  # the logarithm of the factor stays within plus and minus this
 LAST_POWER = 0.1  # of the probabilities in the last stage: most matches are to count, and a robust loss drops outliers
 RELAXATION = 1.3  # of a step: the curvature of a robust loss is less than its weights
+# Points of cameras with a smaller mean focal length are no pixels; they count as those of the other one.
+MIN_FOCAL, NORMAL_FOCAL = 10.0, 1000.0
 MAX_RAY = 1e3  # of the features; far larger ones would overflow in the networks
 EARLY_PIXELS, LAST_PIXELS = 2.0, 0.7  # scales of the losses that candidates are compared by
 PIXEL_FLOOR = 1e-3  # pixels, added to distances before their logarithm
@@ -59,10 +61,10 @@ def run_pose_stages(
     frame = CommonFrame.from_points(problem.points1, problem.points2, present)
     x1, x2 = convert_points_to_homogeneous(torch.stack([frame.x1, frame.x2])).mT.contiguous()
     model = Essential.of_cameras(K1, K2, frame.T, frame.T)
-    evidence, unit = Evidence.from_points(x1, x2), frame.inverse[:, 0, 0, None]
+    evidence, unit = Evidence.from_points(x1, x2), frame.inverse[:, 0, 0, None] * _pixels(K1, K2)
     matches = _Matches(evidence, model, unit)
     upright = upright_rotation(frame, present)
-    rays = _rays(frame, upright, model, x1, x2)
+    rays = _rays(frame, upright, model, x1, x2, unit)
     features = torch.cat([match_features(frame, upright, scores, present), rays], -1)
     states: list[Calibrated] = []
     found: list[Tensor] = []
@@ -229,14 +231,20 @@ class _Matches(NamedTuple):
         return kept
 
 
-def _rays(frame: CommonFrame, upright: Tensor, model: Essential, x1: Tensor, x2: Tensor) -> Tensor:
+def _pixels(K1: Tensor, K2: Tensor) -> Tensor:
+    """Return how many pixels the unit of the points has, (B, 1): one, but for normalised coordinates."""
+    K = torch.stack([K1, K2])
+    focal = (K[..., 0, 0] / K[..., 2, 2]).abs().mean(0)[:, None]
+    return torch.where(focal < MIN_FOCAL, NORMAL_FOCAL / focal, 1.0)
+
+
+def _rays(frame: CommonFrame, upright: Tensor, model: Essential, x1: Tensor, x2: Tensor, unit: Tensor) -> Tensor:
     """Return the directions of both points and the frame's unit in pixels as features, (B, N, 5)."""
     rays = torch.stack([model.C1 @ x1, model.C2 @ x2], 1)
     first, second = torch.where(frame.swapped[:, None, None, None], rays.flip(1), rays).unbind(1)
     rays = torch.stack([first, upright @ second], 1)
     rays = (rays[:, :, :2] / rays[:, :, 2:]).clamp(-MAX_RAY, MAX_RAY)
-    unit = (frame.inverse[:, :1, :1] / 100).log().expand(-1, 1, rays.shape[-1])
-    return torch.cat([rays.flatten(1, 2), unit], 1).mT
+    return torch.cat([rays.flatten(1, 2), (unit[..., None] / 100).log().expand(-1, 1, rays.shape[-1])], 1).mT
 
 
 def _in_spans(spans: Tensor) -> Candidates:

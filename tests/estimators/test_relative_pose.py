@@ -4,6 +4,7 @@ import pytest
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from kornia.geometry.epipolar import essential_from_Rt
+from kornia.geometry.linalg import transform_points
 from pairwise import pairwise
 from references import true_essential, up_to_sign
 from scenes import distorted, roughened, scenes, seeded, uniform
@@ -81,6 +82,17 @@ def test_few_inliers_are_searched_again(monkeypatch):
             found = layer.estimate(scene.points1, scene.points2, scene.K1, scene.K2)
         right.append((pose_error(found.R, found.t, scene.R, scene.t) < 5).double().mean())
     assert right[0] > right[1] + 0.2
+
+
+def test_normalised_coordinates():
+    """Cameras may be the identity."""
+    scene, eye = scenes("handheld", 20, 300, noise=0.5, outliers=0.5), torch.eye(3, dtype=torch.float64)[None]
+    points = (
+        transform_points(torch.linalg.inv(K), p) for K, p in ((scene.K1, scene.points1), (scene.K2, scene.points2))
+    )
+    with torch.no_grad():
+        found = kln.LearnedRelativePose.from_pretrained().estimate(*points, eye, eye)
+    assert (pose_error(found.R, found.t, scene.R, scene.t) < 5).double().mean() > 0.8
 
 
 def test_cameras_are_left_where_matches_contradict_them():
