@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from kornia_learnnorm.geometry.checks import solve_dtype
+from kornia_learnnorm.geometry.checks import check_pairs, check_tensor, solve_dtype
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 
 Residual = Callable[[Tensor, Tensor, Tensor], Tensor]  # distances (B, N) of points (B, N, 2) x 2 under (B, 3, 3)
@@ -80,6 +80,8 @@ class EpipolarLoss(nn.Module):
 
 
 def _distances(residual: Residual, points1: Tensor, points2: Tensor, M: Tensor, most: float = MAX_DISTANCE) -> Tensor:
+    check_pairs(points1, points2, ["B", "N", "2"])
+    check_tensor("F_mat", M, [str(len(points1)), "3", "3"])
     # In float64: next to an epipole, the square of a line's normal leaves the range of float32.
     return residual(*(value.to(solve_dtype(M.device)) for value in (points1, points2, M))).clamp(max=most)
 
