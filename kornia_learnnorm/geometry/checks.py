@@ -38,12 +38,12 @@ def check_tensor(name: str, value: object, shape: Sequence[str] | None = None, p
 def check_cameras(K1: Tensor | None, K2: Tensor | None, batch_size: int | None = None) -> None:
     """Raise a clear error for anything but two finite and invertible cameras with a last row (0, 0, w > 0), or none.
 
-    Cameras are (3, 3), or (B, 3, 3) where there is a ``batch_size``. A last row of other numbers is a ValueError that
-    names a transposed camera.
+    Cameras are (3, 3), or where there is a ``batch_size`` also (1, 3, 3) and (B, 3, 3). A last row of other numbers is
+    a ValueError that names a transposed camera.
     """
     if (K1 is None) != (K2 is None):
         raise ValueError(f"K1 and K2 must be given together, got only {'K1' if K2 is None else 'K2'}")
-    shapes = [[3, 3]] if batch_size is None else [[3, 3], [batch_size, 3, 3]]
+    shapes = [[3, 3]] if batch_size is None else [[3, 3], *([n, 3, 3] for n in sorted({1, batch_size}))]
     for name, K in (("K1", K1), ("K2", K2)):
         if K is None:
             continue
