@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("root", metavar="ROOT", type=Path, help="folder of the images; its subfolders count")
     parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="the database to write")
     pairs = parser.add_argument_group("pairs (default: all)").add_mutually_exclusive_group()
-    pairs.add_argument("--gap", metavar="N", type=int, help="only images N apart, by name")
+    pairs.add_argument("--overlap", metavar="N", type=int, help="only images up to N apart, by name")
     pairs.add_argument("--pairs", metavar="FILE", type=Path, help="two names a line, as hloc lists them")
     text = "a store of learnnorm match, or hloc's features and matches, in place of matching"
     pairs.add_argument("--matches", metavar="STORE", type=Path, nargs="+", default=[], help=text)
@@ -76,7 +76,7 @@ def _matches(args: argparse.Namespace, K: NDArray[np.float64] | None) -> Corresp
     if args.matches:
         return read_store(*args.matches) if len(args.matches) == 1 else hloc.read_hloc(*args.matches)
     frames = read_dataset("folder", args.root)
-    pairs, pairing = choose_pairs(frames, args.gap, args.pairs)
+    pairs, pairing = choose_pairs(frames, args.overlap, args.pairs, overlap=True)
     check_images(args.root, [frame.name for frame in frames], K, args.single_camera)
     print(f"{len(frames)} images; {len(pairs)} pairs ({pairing})", file=sys.stderr)
     store = args.out.with_suffix(MATCHES)

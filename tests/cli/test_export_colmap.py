@@ -25,7 +25,7 @@ def photos(written):
     return written / "kitti/sequences/06/image_0"
 
 
-@pytest.mark.parametrize(("args", "pairs"), [([], 6), (["--gap", "2"], 2), (["--pairs"], 1)])
+@pytest.mark.parametrize(("args", "pairs"), [([], 6), (["--overlap", "2"], 5), (["--pairs"], 1)])
 def test_a_folder(photos, tmp_path, capsys, args, pairs):
     names = sorted(path.name for path in photos.iterdir())
     (tmp_path / "pairs.txt").write_text(f"{names[0]} {names[3]}")

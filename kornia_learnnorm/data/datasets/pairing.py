@@ -3,7 +3,7 @@
 import shlex
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import combinations, groupby, starmap
+from itertools import chain, combinations, groupby, starmap
 from pathlib import Path
 
 from kornia_learnnorm.data.datasets.colmap import read_reconstruction
@@ -18,8 +18,12 @@ def choose_pairs(
     listed: Path | None = None,
     model: Path | None = None,
     min_points: int | None = None,
+    overlap: bool = False,
 ) -> tuple[list[FramePair], str]:
-    """Return pairs of frames, listed, by common points, ``gap`` apart or for None all, and how they were chosen."""
+    """Return pairs of frames, listed, by common points, ``gap`` apart or for None all, and how they were chosen.
+
+    With ``overlap``, frames that are less than ``gap`` apart are pairs, too.
+    """
     found: Iterable[FramePair]
     if listed is not None:
         found, text = listed_pairs(frames, listed), f"listed in {listed.name}"
@@ -30,7 +34,9 @@ def choose_pairs(
     elif gap is None:
         found, text = starmap(FramePair, combinations(frames, 2)), "all pairs"
     else:
-        found, text = pair_frames(frames, gap), "consecutive frames" if gap == 1 else f"frames {gap} apart"
+        gaps = [*(range(1, gap) if overlap else []), gap]
+        found = chain.from_iterable(pair_frames(frames, apart) for apart in gaps)
+        text = "consecutive frames" if gap == 1 else f"frames {'up to ' if overlap else ''}{gap} apart"
     pairs = list(found)
     if not pairs:
         raise ValueError(f"no pairs of frames to match ({text}) among {len(frames)} frames")
