@@ -51,6 +51,7 @@ def check_grey(image: Pixels, colour: bool = False) -> None:
     if image.size == 0 or not (image.ndim == 2 or (colour and image.ndim == 3 and image.shape[2] == 3)):
         expected = "grey or RGB with shape (H, W) or (H, W, 3)" if colour else "grey with shape (H, W)"
         hint = "; .movedim(0, -1) brings the colours of a tensor to the end" if image.shape[:1] == (3,) else ""
+        hint = "; image[..., :3] is without transparency" if image.shape[2:] == (4,) else hint
         raise ValueError(f"an image must be {expected}, got {image.shape}{hint}")
 
 

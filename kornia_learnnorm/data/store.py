@@ -62,6 +62,9 @@ class CorrespondenceStore:
     def __len__(self) -> int:
         return len(self.offsets) - 1
 
+    def __repr__(self) -> str:
+        return f"<store of {len(self)} image pairs, {len(self.points1)} correspondences: {self.dataset!r}>"
+
     def rows(self, pair: int, max_ratio: MaxRatio = None) -> NDArray[np.int64]:
         """Return the rows (N,) of the correspondences of :meth:`matches`, in increasing order."""
         rows = np.arange(self.offsets[pair], self.offsets[pair + 1])
@@ -103,6 +106,8 @@ class StoreReader:
             hint = "" if named else "; write some pairs of a store as FILE.h5@FIRST:STOP, for example s.h5@3:10"
             if self.path.is_dir():
                 hint = "; it is a folder, and learnnorm match folder makes a store of a folder of images"
+            elif Path(f"{self.path}.parts").is_dir():
+                hint = "; its matching was interrupted: run the same learnnorm match again, which continues"
             raise FileNotFoundError(f"no store at {self.path}{hint}")
         with open_hdf5(self.path) as file:
             offsets = _read_offsets(self.path, file)

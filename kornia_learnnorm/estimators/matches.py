@@ -161,8 +161,9 @@ def _check_pairs(k: int, pairs: Tensor, number1: int, number2: int) -> None:
     if pairs.ndim != 2 or pairs.shape[1] != 2:
         raise ValueError(f"matches of pair {k} must have shape [S, 2], got {[*pairs.shape]}")
     limit = torch.tensor([number1, number2], device=pairs.device)
-    if bool(((pairs < 0) | (pairs >= limit)).any()):
-        raise ValueError(f"matches of pair {k} must be indices of {number1} and {number2} keypoints, got others")
+    if len(wrong := ((pairs < 0) | (pairs >= limit)).any(1).nonzero()):
+        expected, row = f"indices of {number1} and {number2} keypoints", int(wrong[0])
+        raise ValueError(f"matches of pair {k} must be {expected}, got {pairs[row].tolist()} in row {row}")
 
 
 def _check_scores(k: int, scores: Tensor, number: int) -> None:

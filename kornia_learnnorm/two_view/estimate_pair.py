@@ -230,7 +230,7 @@ def _pixels(image: Image, max_size: int, colour: bool) -> tuple[NDArray[np.uint8
         return (images.read_colour if colour else images.read_image)(image, max_size), images.image_size(image)
     values = image.cpu().numpy() if isinstance(image, Tensor) else image
     if not isinstance(values, np.ndarray) or values.dtype != np.uint8:
-        hint = "values from 0 to 1 times 255 in uint8" if hasattr(values, "dtype") else "numpy.asarray(image)"
+        hint = "values from 0 to 255 in uint8" if hasattr(values, "dtype") else "numpy.asarray(image)"
         got = f"got {getattr(values, 'dtype', type(values))}: try {hint}"
         raise TypeError(f"an image must be a path or an array of uint8, {got}")
     images.check_grey(values, colour=True)

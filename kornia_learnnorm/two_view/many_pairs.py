@@ -26,7 +26,7 @@ from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.two_view.estimate_pair import MAX_SIZE, check_matching, estimate_pair
 from kornia_learnnorm.two_view.input_checks import check_number, check_settings
-from kornia_learnnorm.two_view.result import NoReliableMatrixError, package_versions
+from kornia_learnnorm.two_view.result import CONVENTION, NoReliableMatrixError, package_versions
 
 RESULTS = "pairs.jsonl"  # one line a pair, in the order in which they are done
 TABLE = "pairs.csv"  # the same without the matches; the pairs of the last run come first, in their order
@@ -183,14 +183,16 @@ def _parse(path: Path, text: str) -> Any:
 
 
 def describe_failure(code: str, text: str, image1: Path, image2: Path, options: PairOptions) -> Line:
-    """Return the JSON object of a pair without a matrix: ``model`` is null, and the warning has a code and a text."""
+    """Return the JSON object of a pair without a matrix: null, and a warning with a code and a text."""
 
     def describe(path: Path) -> Line:  # sizes are null where the file cannot be read
         width, height = image_size(path) if path.is_file() else (0, 0)
         return {"file": str(path), "width": width or None, "height": height or None}
 
     return {
-        **dict.fromkeys(("model", "F", "H", "E", "R", "t", "n", "predicted_error_px")),
+        **dict.fromkeys(("model", "choice", "F", "H", "E", "R", "t", "n", "other_pose")),
+        "convention": CONVENTION,
+        **dict.fromkeys(("predicted_error_px", "num_matches", "num_inliers")),
         "warnings": [{"code": code, "text": text}],
         "image1": describe(image1),
         "image2": describe(image2),

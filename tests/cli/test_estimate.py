@@ -74,7 +74,7 @@ class TestOnePair:
         assert captured.out == "wrote    F.json\n"
         assert "no reliable matrix (no_motion): " in captured.err
         failure = json.loads(Path("F.json").read_text())
-        assert [failure[name] for name in ("model", "F", "H", "R", "t", "predicted_error_px")] == [None] * 6
+        assert [failure[name] for name in ("model", "choice", "F", "R", "other_pose", "num_inliers")] == [None] * 6
         assert [warning["code"] for warning in failure["warnings"]] == ["no_motion"]
         assert failure["image1"] == {"file": f"{planes}/left.png", "width": WIDTH, "height": HEIGHT}
         assert [failure[name] for name in ("estimator", "seed", "ratio", "threshold_px")] == ["RANSAC", 0, 0.8, 1]

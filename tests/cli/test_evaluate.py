@@ -151,10 +151,12 @@ def test_json_is_not_written_where_a_command_fails_or_over_its_input(folder, tmp
 
 
 def test_stores_and_weights_are_checked_first(folder, refused):
+    (folder / "cut.h5.parts").mkdir()
     for stores, weights, message in [
         (["known.h5"], ["tilted", "other/tilted"], "two methods have the same name, tilted: "),
         (["known.h5", "other/known.h5"], ["tilted"], "two files have the same name, known: "),
         (["known.h5", "none.h5"], ["tilted"], "no store at"),
+        (["cut.h5"], ["tilted"], "was interrupted: run the same learnnorm match again"),
         (["tilted"], ["tilted"], "tilted; it is a folder, and learnnorm match folder makes"),
         (["known.h5", "known.h5@2:19"], ["tilted"], "pairs 2:19 were asked for, the store has 0:9"),
         (["tilted/weights.safetensors"], ["tilted"], "not a readable HDF5 file"),
