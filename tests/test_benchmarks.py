@@ -178,7 +178,6 @@ def test_refined_matches_beside_found_and_tracked_ones(tmp_path):
 
 
 def test_reconstruction(real_data, tmp_path):
-    """Four photographs of half the size."""
     pytest.importorskip("pycolmap")
     source, names = real_data / "images/photographs", [f"fountain-P11/000{number}.jpg" for number in range(3, 7)]
     cameras = json.loads((source / "cameras.json").read_text())

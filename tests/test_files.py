@@ -72,7 +72,6 @@ def test_a_read_only_place_names_the_file(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("error", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO])
 def test_a_full_disk_names_the_file(tmp_path, error):
-    """The file that was written, not those around it."""
     outer, inner = tmp_path / "outer.json", tmp_path / "inner.json"
     with (
         pytest.raises(OSError, match=os.strerror(error)) as caught,

@@ -180,7 +180,6 @@ class TestNetworks:
                 self.check(program, network, example)
 
     def test_network_of_a_normaliser(self):
-        """The layer stays as it is, in training and float64."""
         network = kln.CrossViewNetwork(width=8, depth=1)
         layer = kln.EightPoint(shaken(kln.LearnedNormalizer(network=network))).double().train()
         (program,) = export_networks(layer).values()

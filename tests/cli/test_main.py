@@ -95,7 +95,6 @@ def test_every_config_runs(name, data, tmp_path, monkeypatch, capsys, refused):
 
 @pytest.mark.parametrize("name", OF_SETS)
 def test_every_config_of_an_estimator_runs(name, request, tmp_path, monkeypatch, capsys, refused):
-    """Those of real stores are only made."""
     config = ["--config", str(FOLDER / f"{name}.yaml")]
     config += ["--trainer.enable_progress_bar=false", f"--trainer.default_root_dir={tmp_path}"]
     if not name.endswith("synthetic"):

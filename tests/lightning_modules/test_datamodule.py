@@ -85,7 +85,6 @@ def test_batch_pairs_are_for_training_alone():
 )
 @pytest.mark.parametrize("world_size", [2, 3])
 def test_processes_share_an_epoch(source, size, by_pair, world_size):
-    """Every sample once in an epoch, in as many batches for each process."""
     loaders = [BatchLoader(source, size, 0, True, by_pair, 0, rank, world_size) for rank in range(world_size)]
     whole = BatchLoader(source, size, 0, True, by_pair)
     for epoch in range(2):

@@ -165,7 +165,6 @@ class TestMaxPoints:
             assert torch.equal(found[1], unlimited[1])
 
     def test_larger_sets_get_hartleys_without_the_network(self):
-        """With weights too, where no set has few correspondences."""
         normalizer, points, calls = shaken(), correspondences("handheld", 4, 20), []
         own, weights = normalizer(*points), torch.rand(4, 20) + 0.1
         normalizer.network.register_forward_hook(lambda *args: calls.append(args))

@@ -99,7 +99,6 @@ class TestAccuracy:
         assert optimum.cost_before <= 1.001 * optimum.cost
 
     def test_the_optimum_does_not_depend_on_the_samples(self):
-        """Of coarse matches, where a first batch of samples is enough."""
         points, cameras, _, _ = pair("driving", 400, noise=1.0, outliers=0.1, seed=9)
         Fs = [RANSAC(seed=seed, inl_th=2.0).estimate(*points, None, *cameras).F_mat for seed in range(6)]
         costs = kln.GemanMcClure(1.4)(torch.stack([kln.sampson_distance(*points, F) for F in Fs]).square())[0].sum(-1)
@@ -140,7 +139,6 @@ class TestInexactCameras:
 
 
 def test_matches_behind_a_camera_do_not_count_in_the_fit():
-    """They agree with the epipolar geometry."""
     points, cameras, E, _ = pair(noise=0.5, outliers=0.0)
     points1, points2 = (p.clone() for p in points)
     K1, K2 = cameras

@@ -163,7 +163,6 @@ class TestAccuracy:
 
 
 def test_seeded_calls_repeat_exactly_and_leave_the_global_generator():
-    """Also by seeds of NumPy and under another default dtype."""
     points, ransac, state = [p.float() for p in pair()[:2]], RANSAC(seed=3), torch.get_rng_state()
     first = ransac(*points)
     torch.testing.assert_close(ransac(*points), first, rtol=0, atol=0)
@@ -289,7 +288,6 @@ class TestHardInput:
 
     @pytest.mark.parametrize("planes", [1, 2])
     def test_planes(self, planes):
-        """Two planes determine the matrix, one does not."""
         scene = one_scene("handheld", 400, noise=0.0, outliers=0.0)
         normals = torch.tensor([[0.02, 0.18, 0.06], [0.01, -0.01, 0.07]], dtype=torch.float64)[:planes]
         H = scene.K2 @ (scene.R + scene.t[:, None] * normals[:, None]) @ torch.linalg.inv(scene.K1)

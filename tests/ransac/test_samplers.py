@@ -57,7 +57,6 @@ class TestWeighted:
 
 
 def test_among_some_rows_and_hit_rate(generator):
-    """A weight still counts, and too few rows are not sampled."""
     rows = torch.arange(40)
     for sampler, share in ((UniformSampler(40, CPU, 1), 0.5), (WeightedSampler(1.0 + (rows < 30), 1), 0.8)):
         drawn = sampler.among(rows >= 20).draw(4000, generator)

@@ -191,7 +191,6 @@ class TestCameraMisfit:
         assert angle == pytest.approx(pose_error(*poses[0], *poses[1]).item(), abs=0.2)
 
     def test_false_matches_that_agree_do_not_count(self):
-        """A third as many, of another motion."""
         other = handheld(1, 100, seeded(5), noise=0.3)
         points = (torch.cat([x, y[0]]) for x, y in zip(POINTS, (other.points1, other.points2), strict=True))
         assert camera_misfit(*points, F_MAT, 1.0, (K, K))[0] < 0.03
@@ -212,7 +211,6 @@ class TestCameraMisfit:
 
 @pytest.mark.parametrize("k1", [-0.25, 0.0, 0.15])
 def test_lens_misfit(k1):
-    """By the distortion of OpenCV, and the error of the pose."""
     cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
     rays = [(torch.nn.functional.pad(x, (0, 1), value=1.0) @ torch.linalg.inv(K).mT).numpy() for x in POINTS]
     bent = [cv2.projectPoints(x, *np.zeros((2, 3)), K.numpy(), np.array([k1, 0, 0, 0]))[0][:, 0] for x in rays]

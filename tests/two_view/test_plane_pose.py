@@ -53,7 +53,6 @@ def test_matrices_of_a_pose():
 
 @pytest.mark.parametrize("baseline", [0.0, 0.002])
 def test_a_rotation(baseline):
-    """Also with a baseline that inexact cameras explain."""
     (pose,) = plane_poses(*seen(baseline * SIDEWAYS, -2.0))
     assert (pose.t, pose.n) == (None, None)
     assert torch.linalg.det(pose.R) == pytest.approx(1)

@@ -72,7 +72,6 @@ class TestReadColmap:
 class TestCovisiblePairs:
     @pytest.mark.parametrize("min_points", [1, 88, 96, 97])
     def test_common_points(self, written, min_points):
-        """As many as the text of the model lists."""
         model = written / "colmap"
         lines = (model / "model" / "images.txt").read_text().splitlines()[1:]
         points = [set(line.split()[2::3]) - {"-1"} for line in lines[1::2]]

@@ -28,7 +28,6 @@ CAMERAS = {"kitti": KITTI_K, "cambridge": CENTRED, "colmap": CENTRED, "folder": 
 
 @pytest.mark.parametrize("dataset", LISTED)
 def test_frames(written, dataset):
-    """Cameras of TUM, and poses of KITTI and TUM, have their own tests."""
     root, options = written / dataset, {}
     if dataset == "colmap":
         pytest.importorskip("pycolmap", reason="pycolmap is not installed")

@@ -81,7 +81,6 @@ def test_robust_estimators_alone_and_beside_predictions(robust_copied, robust_st
 
 
 def test_numbers_of_the_paper_are_only_beside_its_data(written):
-    """The run's store is made of synthetic scenes."""
     for name in ("printed.txt", "tables.json", "report.md", "report.html"):
         assert not re.findall(r"Fan et al|Figure \d|Table \d", (written / name).read_text())
 
