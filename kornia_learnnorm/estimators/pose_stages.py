@@ -20,7 +20,7 @@ from kornia_learnnorm.estimators.weighted_samples import evenly_ranked, sample_n
 from kornia_learnnorm.geometry.checks import is_known_true, safe_divisor
 from kornia_learnnorm.geometry.dlt import row_moments, row_products
 from kornia_learnnorm.geometry.five_point import essential_in_span
-from kornia_learnnorm.geometry.matrices import unit_matrix
+from kornia_learnnorm.geometry.matrices import determinant, unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.essential import Calibrated, Essential, nearest_essential
 from kornia_learnnorm.models.fundamental import Fundamental
@@ -233,8 +233,8 @@ class _Matches(NamedTuple):
 
 def _pixels(K1: Tensor, K2: Tensor) -> Tensor:
     """Return how many pixels the unit of the points has, (B, 1): one, but for normalised coordinates."""
-    K = torch.stack([K1, K2])
-    focal = (K[..., 0, 0] / K[..., 2, 2]).abs().mean(0)[:, None]
+    K = torch.stack([K1, K2]).detach()
+    focal = (determinant(K).abs() / K[..., 2, 2] ** 3).sqrt().mean(0)[:, None]  # geometric mean along the axes
     return torch.where(focal < MIN_FOCAL, NORMAL_FOCAL / focal, 1.0)
 
 

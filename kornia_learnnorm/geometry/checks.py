@@ -43,13 +43,14 @@ def check_cameras(K1: Tensor | None, K2: Tensor | None, batch_size: int | None =
     """
     if (K1 is None) != (K2 is None):
         raise ValueError(f"K1 and K2 must be given together, got only {'K1' if K2 is None else 'K2'}")
-    shapes = [[3, 3]] if batch_size is None else [[3, 3], *([n, 3, 3] for n in sorted({1, batch_size}))]
+    shapes = [[3, 3]] if batch_size is None else [[3, 3], [batch_size, 3, 3], [1, 3, 3]]
     for name, K in (("K1", K1), ("K2", K2)):
         if K is None:
             continue
         check_tensor(name, K)
         if [*K.shape] not in shapes:
-            raise ValueError(f"{name} must have shape {' or '.join(map(str, shapes))}, got {[*K.shape]}")
+            expected = " or ".join(dict.fromkeys(map(str, shapes)))
+            raise ValueError(f"{name} must have shape {expected}, got {[*K.shape]}")
         wrong = ~K.isfinite().flatten(-2).all(-1) | (torch.linalg.det(K.detach().to(solve_dtype(K.device))) == 0)
         if read_condition(wrong.any()):
             raise ValueError(f"{name} must be finite and invertible, got {K.detach()[wrong][0].tolist()}")

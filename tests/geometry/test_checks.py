@@ -26,7 +26,7 @@ class TestCameras:
             (None, K, ValueError, "got only K2"),
             (K, torch.zeros(3, 3), ValueError, "K2 must be finite and invertible"),
             (torch.full((3, 3), torch.nan), K, ValueError, r"K1 must be finite and invertible, got \[\[nan"),
-            (torch.rand(3, 4), K, ValueError, r"K1 .* \[1, 3, 3\] or \[2, 3, 3\], got \[3, 4\]"),
+            (torch.rand(3, 4), K, ValueError, r"K1 .* \[2, 3, 3\] or \[1, 3, 3\], got \[3, 4\]"),
             (K, K.expand(4, 3, 3), ValueError, r"K2 .* got \[4, 3, 3\]"),
             (K.long(), K, TypeError, r"K1 must be a floating-point tensor, got torch\.int64"),
             *((wrong, K, ValueError, f"^K1 .*got {r}; tr") for wrong, r in ((K.T, "320 240 1"), (-K, "-0 -0 -1"))),
