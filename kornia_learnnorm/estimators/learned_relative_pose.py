@@ -149,7 +149,8 @@ class LearnedRelativePose(LearnedLayer):
         r"""Return essential matrices, poses, the inlier probabilities and the result of each stage.
 
         Arguments, shapes and errors are those of :meth:`~kornia_learnnorm.LearnedEightPoint.estimate`, with
-        :math:`N \ge 5`; the cameras are needed, and the points must be pixels.
+        :math:`N \ge 5`; the cameras are needed. Points are pixels, or those of cameras with a focal length below 10
+        normalised coordinates.
 
         Returns:
             the matrices, poses, weights and stages, in the dtype of the points. Of the four poses of an essential

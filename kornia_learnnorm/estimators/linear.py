@@ -251,7 +251,7 @@ class EightPoint(LinearLayer):
             weights: optional non-negative weights with shape :math:`(B, N)`, of any floating-point dtype.
             mask: optional, true for the rows that are correspondences, boolean with shape :math:`(B, N)`. Masked rows
                 may hold any value, NaN too, and get a gradient of zero; without a mask NaN is an error.
-            K1: optional cameras of the first view with shape :math:`(3, 3)` or :math:`(B, 3, 3)`.
+            K1: optional cameras of the first view, :math:`(3, 3)`, :math:`(1, 3, 3)` or :math:`(B, 3, 3)`.
             K2: optional cameras of the second view; both or none.
 
         Returns:

@@ -34,7 +34,7 @@ NEAR, EARLY_NEAR_SCALE, LAST_NEAR_SCALE, SETTLED_SCALE = 3.0, 4.2, 1.0, 4.4
 SCALE_BOUND = 1.5  # the logarithm of the factor stays within plus and minus this
 LAST_POWER = 0.1  # of the probabilities in the last stage: most matches are to count, and a robust loss drops outliers
 RELAXATION = 1.3  # of a step: the curvature of a robust loss is less than its weights
-# Points of cameras with a smaller mean focal length are no pixels; they count as those of the other one.
+# With a mean focal length below the first, points are normalised coordinates, which count as pixels of the second.
 MIN_FOCAL, NORMAL_FOCAL = 10.0, 1000.0
 MAX_RAY = 1e3  # of the features; far larger ones would overflow in the networks
 EARLY_PIXELS, LAST_PIXELS = 2.0, 0.7  # scales of the losses that candidates are compared by

@@ -41,6 +41,7 @@ from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.two_view.solver import MIN_MATCHES, Solution, TwoViewSolver
 
 MIN_MOTION = 0.1  # pixels, median over the matches; below, the camera has not moved
+MIN_EXTENT = 2.0  # pixels; images are larger
 MIN_RIVAL_SHARE = 0.6  # of the inliers; number of outliers that must agree on a second matrix for a warning
 MIN_RIVAL_ANGLE = 15.0  # degrees between the poses of both matrices for a warning
 MIN_DEVIATIONS = 3.0  # by which matches off a plane must prefer one of its poses, or a warning tells of the other
@@ -150,10 +151,11 @@ def _usable_rows(points1: Tensor, points2: Tensor, scores: Tensor, threshold: fl
     points1, points2, scores = points1[finite], points2[finite], scores[finite]
     kept = one_to_one(points1, points2, 1 - scores)
     motion = (points2 - points1).norm(dim=-1)[kept]
+    if len(kept) >= MIN_MATCHES and (most := float(points2.abs().max())) < MIN_EXTENT:
+        raise ValueError(f"pixels expected, got points up to {most:.2g}; multiply normalised ones by a focal length")
     if len(kept) >= MIN_MATCHES and median(motion).item() < MIN_MOTION:
         text = f"no motion between the images (median displacement {median(motion):.2g} px of {len(kept)} matches)"
-        hint = "; the points are smaller than 2, pixels are expected" if float(points2.abs().max()) < 2 else ""
-        raise NoReliableMatrixError("no_motion", f"{text}: the fundamental matrix is not determined{hint}")
+        raise NoReliableMatrixError("no_motion", f"{text}: the fundamental matrix is not determined")
     kept = kept[motion >= MIN_MOTION]  # what stands still lies on an overlay or a dirty lens
     if len(kept) < MIN_MATCHES:
         text = f"{len(kept)} distinct matches of {given} are left, at least {MIN_MATCHES} are needed"

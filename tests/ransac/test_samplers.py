@@ -47,7 +47,6 @@ class TestWeighted:
 
     @pytest.mark.parametrize("size", [5, 8])
     def test_zero_is_never_drawn(self, size, generator):
-        """Next to nothing is, where too few have more."""
         weights = torch.zeros(100, dtype=torch.float64)
         weights[10:14], weights[14:20] = 1e10, 1e-30
         rows = WeightedSampler(weights, size).draw(2000, generator)

@@ -210,6 +210,7 @@ def test_wrong_arguments():
         *(({"size1": s}, ValueError, rf"size1 must be a positive width .* got \({s[0]}") for s in ((0, 0), (640,))),
         ({"size1": (9, 9)}, ValueError, "of 9 points lie in the image of size1, 9 x 9 pixels: points are pixels from"),
         ({"points2": torch.rand(9, 2) * 100 - 200}, ValueError, "0 of 9 points lie in the image of size2, 2 x 2"),
+        ({"points2": torch.rand(9, 2)}, ValueError, "pixels expected, got points up to"),
         ({"size1": 640}, TypeError, "size1 must be a width and a height, got 640"),
         ({"size2": (640.5, 480)}, TypeError, "width and height of size2 must be a whole number, got 640.5"),
         ({"K1": torch.eye(3)}, ValueError, "given together"),
