@@ -23,8 +23,8 @@ from kornia_learnnorm.metrics.poses import pose_error
 from kornia_learnnorm.two_view.estimate_pair import MatchedPair, match_two_images
 
 HEADER = ["detector", "matcher", "refine", "AUC 5", "10", "20", "with cameras: AUC 5", "10", "20", "inliers"]
-METHODS = [f"{detector}+nearest" for detector in ("sift", "rootsift", "xfeat", "disk", "aliked")]
-METHODS += [f"{detector}+lightglue" for detector in ("xfeat", "disk", "aliked")]
+METHODS = ["sift+nearest", "sift+nearest+1", "aliked+lightglue", "aliked+lightglue+1"]
+METHODS += ["xfeat+lightglue", "xfeat+lightglue+2"]
 
 
 def estimate(matched: MatchedPair, pair: FramePair, calibrated: bool) -> tuple[float, int]:
