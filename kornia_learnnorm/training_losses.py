@@ -81,7 +81,9 @@ class EpipolarLoss(nn.Module):
 
 def _distances(residual: Residual, points1: Tensor, points2: Tensor, M: Tensor, most: float = MAX_DISTANCE) -> Tensor:
     check_pairs(points1, points2, ["B", "N", "2"])
-    check_tensor("F_mat", M, [str(len(points1)), "3", "3"])
+    check_tensor("F_mat", M, ["B", "3", "3"])
+    if len(M) != len(points1):
+        raise ValueError(f"one matrix per set of points is needed, got {len(M)} matrices and {len(points1)} sets")
     # In float64: next to an epipole, the square of a line's normal leaves the range of float32.
     return residual(*(value.to(solve_dtype(M.device)) for value in (points1, points2, M))).clamp(max=most)
 

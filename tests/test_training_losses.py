@@ -96,7 +96,8 @@ class TestEpipolarLoss:
             raises(ValueError, f"must be .* got .*{value}", EpipolarLoss, **{name: value})
         *points, F_mat = rows([1.0, 2.0], [3.0, 0.0])
         raises(TypeError, "points1 .* got torch.float16", LogEpipolarLoss(), points[0].half(), points[1], F_mat)
-        raises(ValueError, r"F_mat .*\(2, 3, 3\), got \[2, 1, 3, 3\]", EpipolarLoss(), *points, F_mat[:, None])
+        raises(ValueError, "one matrix per set", EpipolarLoss(), *points, F_mat[:1])
+        raises(ValueError, r"F_mat .*\(B, 3, 3\), got \[2, 1, 3, 3\]", EpipolarLoss(), *points, F_mat[:, None])
 
     @pytest.mark.parametrize("heldout", [(), (None, None), (torch.zeros(1, 3, 2), None), (torch.zeros(1, 0, 2),) * 2])
     def test_heldout_points_are_needed_only_with_a_weight(self, heldout):
@@ -122,6 +123,8 @@ class TestLossesOfSets:
         F_mat = uniform(3, 3, 3, low=-1).requires_grad_()  # entries of one size, as in normalised coordinates
         points = uniform(3, 12, 2, low=-1, seed=1), uniform(3, 12, 2, low=-1, seed=2)
         assert gradcheck(lambda F: loss(*points, F), F_mat, eps=1e-6, atol=1e-4)
+        compiled = torch.compile(loss, fullgraph=True, dynamic=True, backend="eager")
+        assert torch.equal(compiled(*points, F_mat), loss(*points, F_mat))
         on_epipole = ORIGIN.clone().requires_grad_()
         value = loss(torch.zeros(1, 2, 2), torch.ones(1, 2, 2), on_epipole[None])
         (gradient,) = torch.autograd.grad(value.sum(), on_epipole)

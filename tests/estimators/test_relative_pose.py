@@ -117,7 +117,6 @@ def test_cameras_are_left_where_matches_contradict_them():
 
 
 def test_derivatives_by_points_and_cameras_are_those_of_differences():
-    """Where the matches contradict the cameras too."""
     layer, scene = kln.LearnedRelativePose.from_pretrained(), scenes("handheld", 8, 300, noise=0.3)
     layer.refine_steps, factor = 60, torch.rand(3, 3, generator=seeded(), dtype=torch.float64)
     exact, K = (scene.points1, scene.points2), (scene.K1, scene.K2)

@@ -164,7 +164,6 @@ def test_weights_without_a_network_are_one_line(monkeypatch, tmp_path, refused, 
 
 
 def test_weights_without_a_network_end_a_list_of_pairs(monkeypatch, tmp_path, planes):
-    """They are no fault of one pair."""
     missing = Mock(side_effect=urllib.error.URLError("none"))
     monkeypatch.setattr("kornia.feature.xfeat.load_state_dict_from_url", missing)
     pairs, out = [(planes / "left.png", planes / "right.png")], tmp_path / "out"
