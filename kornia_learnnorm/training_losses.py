@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from kornia_learnnorm.geometry.checks import check_pairs, check_tensor, solve_dtype
+from kornia_learnnorm.geometry.checks import check_number_of_matrices, check_pairs, solve_dtype
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 
 Residual = Callable[[Tensor, Tensor, Tensor], Tensor]  # distances (B, N) of points (B, N, 2) x 2 under (B, 3, 3)
@@ -81,9 +81,7 @@ class EpipolarLoss(nn.Module):
 
 def _distances(residual: Residual, points1: Tensor, points2: Tensor, M: Tensor, most: float = MAX_DISTANCE) -> Tensor:
     check_pairs(points1, points2, ["B", "N", "2"])
-    check_tensor("F_mat", M, ["B", "3", "3"])
-    if len(M) != len(points1):
-        raise ValueError(f"one matrix per set of points is needed, got {len(M)} matrices and {len(points1)} sets")
+    check_number_of_matrices("F_mat", M, len(points1))
     # In float64: next to an epipole, the square of a line's normal leaves the range of float32.
     return residual(*(value.to(solve_dtype(M.device)) for value in (points1, points2, M))).clamp(max=most)
 

@@ -17,7 +17,8 @@ from kornia_learnnorm.models.two_view_model import TwoViewModel
 POINT_FEATURES, RESIDUAL_FEATURES = 9, 5  # numbers of a correspondence
 RESIDUAL_FLOOR = 1e-5  # of the frame's unit, added to distances before their logarithm
 DEVIATION_FLOOR = 1e-5  # of the frame's unit: the rounding of an exact shift of the image says nothing
-MIN_SQUARE = 1e-200  # of lengths: the second derivative of a root at zero is not finite
+# Of a length: the second derivative of a root at zero is not finite.
+MIN_SQUARE = {torch.float32: 1e-24, torch.float64: 1e-200}
 MIN_PROBABILITY = 1e-3  # added to the probabilities of inliers in a mean
 FAR_FROM_CHANCE = 1.5  # correlations of rotated views, in root mean squares of those of random matches
 
@@ -43,7 +44,7 @@ class CommonFrame(NamedTuple):
         origin = mean.mean(1)
         centred = points - origin[:, None, None]
         squares = torch.stack([centred, points - mean[:, :, None]]).square().sum(-1)
-        distances = squares.clamp(min=MIN_SQUARE).sqrt()
+        distances = squares.clamp(min=MIN_SQUARE[squares.dtype]).sqrt()
         distances = distances.mean(-1) if share is None else (distances * share).sum(-1)
         radius = distances[0].mean(1)
         radius = radius + (radius == 0)
@@ -89,7 +90,7 @@ def match_features(frame: CommonFrame, upright: Tensor, scores: Tensor | None, p
     second = second + (second - centre) @ (upright[:, :2, :2].mT - torch.eye(2).to(upright))
     shift = second - first
     shift = shift - masked_median(shift, present)
-    length = shift.square().sum(-1, keepdim=True).clamp(min=MIN_SQUARE).sqrt()
+    length = shift.square().sum(-1, keepdim=True).clamp(min=MIN_SQUARE[shift.dtype]).sqrt()
     deviation = masked_median(length, present)
     relative = torch.asinh(shift / deviation.clamp(min=DEVIATION_FLOOR))
     if scores is None:

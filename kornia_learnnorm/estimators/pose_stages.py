@@ -61,7 +61,7 @@ def run_pose_stages(
     frame = CommonFrame.from_points(problem.points1, problem.points2, present)
     x1, x2 = convert_points_to_homogeneous(torch.stack([frame.x1, frame.x2])).mT.contiguous()
     model = Essential.of_cameras(K1, K2, frame.T, frame.T)
-    evidence, unit = Evidence.from_points(x1, x2), frame.inverse[:, 0, 0, None] * _pixels(K1, K2)
+    evidence, unit = Evidence.from_points(x1, x2), frame.inverse[:, 0, 0, None] * _pixels_per_unit(K1, K2)
     matches = _Matches(evidence, model, unit)
     upright = upright_rotation(frame, present)
     rays = _rays(frame, upright, model, x1, x2, unit)
@@ -231,7 +231,7 @@ class _Matches(NamedTuple):
         return kept
 
 
-def _pixels(K1: Tensor, K2: Tensor) -> Tensor:
+def _pixels_per_unit(K1: Tensor, K2: Tensor) -> Tensor:
     """Return how many pixels the unit of the points has, (B, 1): one, but for normalised coordinates."""
     K = torch.stack([K1, K2]).detach()
     focal = (determinant(K).abs() / K[..., 2, 2] ** 3).sqrt().mean(0)[:, None]  # geometric mean along the axes

@@ -112,14 +112,19 @@ def check_mask(mask: Tensor, points1: Tensor, points2: Tensor, weights: Tensor |
 
 def check_matrices(name: str, matrices: Tensor, number: int) -> None:
     """Raise a clear error for anything but so many finite matrices ``(B, 3, 3)`` other than zero."""
-    check_tensor(name, matrices, ["B", "3", "3"])
-    if len(matrices) != number:
-        raise ValueError(f"one matrix per set of points is needed, got {len(matrices)} matrices and {number} sets")
+    check_number_of_matrices(name, matrices, number)
     if read_condition(~matrices.isfinite().all()):
         raise ValueError(f"{name} must be finite, got {int((~matrices.isfinite()).sum())} NaN or infinite values")
     zero = (matrices == 0).all(-1).all(-1)
     if read_condition(zero.any()):
         raise ValueError(f"{name} must not be zero, got {int(zero.sum())} zero matrices")
+
+
+def check_number_of_matrices(name: str, matrices: Tensor, number: int) -> None:
+    """Raise a clear error for anything but so many matrices ``(B, 3, 3)``, of any values."""
+    check_tensor(name, matrices, ["B", "3", "3"])
+    if len(matrices) != number:
+        raise ValueError(f"one matrix per set of points is needed, got {len(matrices)} matrices and {number} sets")
 
 
 def check_choice(name: str, value: object, choices: Collection[str]) -> None:

@@ -183,7 +183,7 @@ def _parse(path: Path, text: str) -> Any:
 
 
 def describe_failure(code: str, text: str, image1: Path, image2: Path, options: PairOptions) -> Line:
-    """Return the JSON object of a pair without a matrix: null, and a warning with a code and a text."""
+    """Return the JSON object of a pair without a matrix: the reason as a warning, and null for what is not known."""
 
     def describe(path: Path) -> Line:  # sizes are null where the file cannot be read
         width, height = image_size(path) if path.is_file() else (0, 0)

@@ -370,7 +370,6 @@ class TestFiles:
 
     @pytest.mark.parametrize("kind", ["fundamental", "homography"])
     def test_of_an_earlier_version(self, kind, tmp_path):
-
         def drop(_, metadata):
             architecture = json.loads(metadata["architecture"])
             del architecture["samples"]
