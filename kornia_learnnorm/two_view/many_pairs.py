@@ -20,7 +20,7 @@ from kornia_learnnorm.data.matching.features import MissingWeightsError
 from kornia_learnnorm.data.matching.workers import open_workers
 from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.estimators.match_refiner import MatchRefiner
-from kornia_learnnorm.files import atomic_write, changed_options, exclusive, full_disk_names, write_text
+from kornia_learnnorm.files import atomic_write, changed_options, exclusive, explained, full_disk_names, write_text
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 from kornia_learnnorm.ransac.ransac import RANSAC
@@ -88,10 +88,8 @@ def read_pair_list(path: str | Path) -> list[FilePair]:
     """
     path, pairs = Path(path), []
     for line in text_lines(path, "list of pairs"):
-        try:
+        with explained(f"{path}, line {line.number}", ValueError):
             names = shlex.split(line.text, comments=True)
-        except ValueError as error:
-            raise ValueError(f"{path}, line {line.number}: {error}") from error
         if names and len(names) != 2:
             raise line.error("two image files")
         pairs += [(path.parent / names[0], path.parent / names[1])] if names else []
@@ -176,10 +174,8 @@ def _read_done(path: Path) -> dict[FilePair, Line]:
 
 
 def _parse(path: Path, text: str) -> Any:
-    try:
+    with explained(f"{path} is damaged: remove it and estimate again", ValueError):
         return json.loads(text)
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged: remove it and estimate again: {error}") from error
 
 
 def describe_failure(code: str, text: str, image1: Path, image2: Path, options: PairOptions) -> Line:
