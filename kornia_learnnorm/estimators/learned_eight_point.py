@@ -14,7 +14,7 @@ from kornia_learnnorm.estimators.linear import essential_matrix
 from kornia_learnnorm.estimators.moments import SQUARE_FLOOR, Evidence, descend, geometric_scale, least_cost, pick
 from kornia_learnnorm.estimators.stages import Refinement
 from kornia_learnnorm.estimators.weighted_samples import evenly_ranked, fit_samples, sample_null_spaces
-from kornia_learnnorm.geometry.checks import check_cameras, check_whole_number, is_known_true
+from kornia_learnnorm.geometry.checks import check_cameras, is_known_true
 from kornia_learnnorm.geometry.seven_point import fundamental_in_span
 from kornia_learnnorm.models.fundamental import Fundamental, Rank2, Rank2Method
 
@@ -194,9 +194,10 @@ class LearnedEightPoint(LearnedLayer):
         refine_steps: int = 10,
         samples: int = 96,
     ) -> None:
-        super().__init__(Fundamental(rank2), width, depth, stages, learn_transforms, refine_steps)
-        check_whole_number("samples", samples, 0)
-        self.rank2, self.samples = rank2, samples
+        super().__init__(Fundamental(rank2), width, depth, stages, refine_steps, samples)
+        if not isinstance(learn_transforms, bool):
+            raise ValueError(f"learn_transforms must be true or false, got {learn_transforms!r}")
+        self.rank2, self.learn_transforms = rank2, learn_transforms
 
     @classmethod
     def from_pretrained(cls, name: str | Path = "robust-synthetic") -> LearnedEightPoint:

@@ -16,7 +16,6 @@ from kornia_learnnorm.estimators.network_features import CommonFrame
 from kornia_learnnorm.estimators.optimize import UNROLLED_LOSS
 from kornia_learnnorm.estimators.stages import Refinement
 from kornia_learnnorm.estimators.weighted_samples import draw_matches, evenly_ranked
-from kornia_learnnorm.geometry.checks import check_whole_number
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.homography import Homography, solve_four_points, squared_distances
@@ -178,9 +177,7 @@ class LearnedHomography(LearnedLayer):
     def __init__(
         self, width: int = 48, depth: int = 4, stages: int = 2, refine_steps: int = 3, samples: int = 64
     ) -> None:
-        super().__init__(Homography(), width, depth, stages, True, refine_steps)
-        check_whole_number("samples", samples, 0)
-        self.samples = samples
+        super().__init__(Homography(), width, depth, stages, refine_steps, samples)
 
     @classmethod
     def from_pretrained(cls, name: str | Path = "robust-homography") -> LearnedHomography:

@@ -46,23 +46,21 @@ class LearnedLayer(MatchLayer):
     model_name: str  # of the model whose files this class loads
     # Numbers that a stage's network reads of a correspondence, reads from the second on, and gives for the whole set.
     features, residual_features, outputs = POINT_FEATURES, RESIDUAL_FEATURES, 2 * TRANSFORM_PARAMS
-    # Arguments that files hold.
-    architecture: tuple[str, ...] = ("width", "depth", "stages", "learn_transforms", "refine_steps")
+    architecture: tuple[str, ...]  # arguments that files hold
     added: ClassVar[dict[str, Any]] = {}  # those that files of earlier versions lack
     refinement: type[Refinement] = Refinement
-    samples = 0
+    learn_transforms = True
 
     def __init__(
-        self, model: TwoViewModel, width: int, depth: int, stages: int, learn_transforms: bool, refine_steps: int
+        self, model: TwoViewModel, width: int, depth: int, stages: int, refine_steps: int, samples: int
     ) -> None:
         super().__init__()
         for name, number in {"width": width, "depth": depth, "stages": stages}.items():
             checks.check_whole_number(name, number, 1)
-        checks.check_whole_number("refine_steps", refine_steps, 0)
-        if not isinstance(learn_transforms, bool):
-            raise ValueError(f"learn_transforms must be true or false, got {learn_transforms!r}")
+        for name, number in {"refine_steps": refine_steps, "samples": samples}.items():
+            checks.check_whole_number(name, number, 0)
         self.model, self.width, self.depth, self.stages = model, width, depth, stages
-        self.learn_transforms, self.refine_steps = learn_transforms, refine_steps
+        self.refine_steps, self.samples = refine_steps, samples
         sizes = [self.features] + (stages - 1) * [self.features + self.residual_features]
         self.networks = nn.ModuleList(SetWeightingNetwork(size, width, depth, self.outputs) for size in sizes)
         self.detach_stages = False

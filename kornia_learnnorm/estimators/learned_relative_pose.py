@@ -13,7 +13,7 @@ from kornia_learnnorm.estimators.learned_layer import LearnedLayer, check_scores
 from kornia_learnnorm.estimators.optimize import choose
 from kornia_learnnorm.estimators.pose_stages import run_pose_stages
 from kornia_learnnorm.estimators.stages import in_pieces
-from kornia_learnnorm.geometry.checks import check_cameras, check_whole_number, inference_mode, is_known_true
+from kornia_learnnorm.geometry.checks import check_cameras, inference_mode, is_known_true
 from kornia_learnnorm.geometry.dlt import MIN_GAP
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.pose import choose_pose
@@ -88,14 +88,13 @@ class LearnedRelativePose(LearnedLayer):
     architecture = ("width", "depth", "stages", "refine_steps", "samples")
     features, residual_features = LearnedLayer.features + 5, LearnedLayer.residual_features + 1
     outputs = 1  # the logarithm of the robust scale's factor
+    learn_transforms = False
 
     def __init__(
         self, width: int = 48, depth: int = 4, stages: int = 2, refine_steps: int = 5, samples: int = 64
     ) -> None:
         eye = torch.eye(3)[None]
-        super().__init__(Essential(eye, eye), width, depth, stages, False, refine_steps)
-        check_whole_number("samples", samples, 0)
-        self.samples = samples
+        super().__init__(Essential(eye, eye), width, depth, stages, refine_steps, samples)
 
     @classmethod
     def from_pretrained(cls, name: str | Path = "robust-pose-synthetic") -> LearnedRelativePose:
