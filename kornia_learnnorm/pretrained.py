@@ -7,7 +7,6 @@ import importlib
 import inspect
 import json
 from collections.abc import Callable, Collection, Mapping
-from hashlib import sha256
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
@@ -120,11 +119,6 @@ def weights_model(name: str | Path) -> str:
         return str(json.loads(_metadata(weights_path(name))["architecture"])["model"])
     except (OSError, SafetensorError, ValueError, LookupError, TypeError):
         return ""
-
-
-def weights_digest(name: str | Path) -> str:
-    """Return a hash of shipped weights, by name, or of a file."""
-    return sha256(weights_path(name).read_bytes()).hexdigest()[:16]
 
 
 def weights_path(name: str | Path) -> Path:

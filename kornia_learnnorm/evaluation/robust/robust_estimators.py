@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
+from hashlib import sha256
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from kornia_learnnorm.evaluation.methods import REFINED, base_name, find_method,
 from kornia_learnnorm.evaluation.robust.peers import CALIBRATED, PEERS, Peer, find_peer, peer_version
 from kornia_learnnorm.evaluation.tables import names_of
 from kornia_learnnorm.models.fundamental import Fundamental
-from kornia_learnnorm.pretrained import weights_digest, weights_model
+from kornia_learnnorm.pretrained import weights_model, weights_path
 
 TRUTH = "ground-truth"
 MAX_SAMPLES = 20_000  # minimal samples of RANSAC:METHOD, whose normaliser can be a network
@@ -160,7 +161,7 @@ def identify_estimator(name: str) -> str:
         return peer_version(name)
     kind, method = _split(name)
     if kind in (LEARNED, GUIDED):
-        return f"{name} {weights_digest(_weights_of(method))}"
+        return f"{name} {sha256(weights_path(_weights_of(method)).read_bytes()).hexdigest()[:16]}"
     return f"{kind}{identify_method(method)}" if kind else name
 
 
