@@ -1,9 +1,7 @@
 """The contract of a two-view model: what differs between fundamental, essential matrices and homographies.
 
 Layers, the optimiser and RANSAC are written once, against :class:`TwoViewModel`. A new model is one subclass and the
-:class:`State` on its manifold. Their constraints are rank 2 of a fundamental matrix, two equal singular values of an
-essential one, and none of a homography: its four points give eight rows and an exact matrix, so that normalisation and
-weights matter above four.
+:class:`State` on its manifold.
 """
 
 from abc import ABC, abstractmethod

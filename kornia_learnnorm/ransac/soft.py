@@ -1,8 +1,4 @@
-r"""RANSAC made soft, for training: hypotheses from random minimal samples, scored smoothly, chosen by a softmax.
-
-What a loss of the chosen hypothesis says about the points, the normaliser and the scores is an ordinary derivative;
-what it says about the probabilities that the samples were drawn with comes from the score function (REINFORCE).
-"""
+"""RANSAC made soft, for training: hypotheses from random minimal samples, scored smoothly, chosen by a softmax."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -91,7 +87,7 @@ def expected_loss(
               L = \sum_k p_k\, \ell(F_k).
 
     Gradients reach the points and the normaliser through :math:`\ell` and through :math:`s`. With ``log_probs`` they
-    reach the sampling as well, by the score function: the gradient of the loss gets the term
+    reach the sampling as well, by the score function (REINFORCE): the gradient of the loss gets the term
     :math:`\sum_k (L - L_{-k}) \nabla \log P_k`, in which the baseline :math:`L_{-k}`, the expected loss without sample
     :math:`k`, takes away variance and adds no bias.
 
