@@ -43,13 +43,7 @@ class LearnedEstimate(NamedTuple):
 
 
 class FundamentalRefinement(Refinement):
-    r"""The refinement of a stage's fundamental matrices, and in the last stage a search among samples.
-
-    Sets of at least 16 matches, eight of which are to be inliers, are searched: the network's matrix competes with
-    those of samples that are drawn by the probabilities of inliers, minimal ones and larger ones, which average the
-    noise. The one of least cost of all matches, whatever their probabilities, is fitted to them by reweighted least
-    squares.
-    """
+    """Robust refinement of a stage's matrices, and in the last stage the search of :class:`LearnedEightPoint`."""
 
     min_searched = MIN_MATCHES
 

@@ -50,16 +50,14 @@ class HomographyEstimate(NamedTuple):
 
 
 class HomographyRefinement(Refinement):
-    r"""Reweighted least squares of a stage's homographies, and in the last stage a search among minimal samples.
+    r"""Reweighted least squares of a stage's matrices, and in the last the search of :class:`LearnedHomography`.
 
     Correspondences enter a step through the :math:`9 \times 9` matrix of the second moments of their design rows alone,
     which weighted moments of view 1's points make: a step costs little for ten matches and for thousands.
 
     Matches are weighted by the probabilities of inliers and the derivative of Geman and McClure's loss of squared
     distances :math:`r` over a squared scale, :math:`(1 + r)^{-2}`. In the last stage these are probabilities to the
-    power of 0.05 and :math:`(1 + r^2)^{-2}`, which leaves inliers nearly equal weights; sets of at least eight matches
-    start from their refined matrix or one of minimal samples that are drawn by the probabilities of inliers, whichever
-    has the least cost of all matches, whatever their probabilities.
+    power of 0.05 and :math:`(1 + r^2)^{-2}`, which leaves inliers nearly equal weights.
     """
 
     model: Homography
