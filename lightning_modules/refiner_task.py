@@ -75,8 +75,7 @@ class HeldOutLoss(nn.Module):
             return torch.stack([self.estimator(*pair)[0] for pair in pairs])
         calibrated = isinstance(self.estimator, LearnedRelativePose)
         cameras = [K.repeat(2, 1, 1) for K in cameras_of(sets)] if calibrated else []
-        F_mat: Tensor = self.estimator.estimate(halves1, halves2, *cameras).F_mat
-        return F_mat
+        return self.estimator.estimate(halves1, halves2, *cameras).F_mat
 
 
 def all_matches(sets: MatchSets) -> tuple[Tensor, Tensor]:

@@ -194,8 +194,7 @@ def weighted_mean(values: Tensor, weights: Tensor | None) -> Tensor:
     total = weights.sum(-1, keepdim=True)
     empty = total == 0
     # On a CPU, a product with a row is faster than a sum over the last axis but one.
-    mean: Tensor = ((weights + empty)[..., None, :] @ values)[..., 0, :] / (total + weights.shape[-1] * empty)
-    return mean
+    return ((weights + empty)[..., None, :] @ values)[..., 0, :] / (total + weights.shape[-1] * empty)
 
 
 def safe_divisor(values: Tensor) -> Tensor:

@@ -54,8 +54,7 @@ class Residuals(ABC):
         """Return the squared distances (B, N) of residuals (B, C N)."""
         if self.components == 1:
             return residual.square()
-        total: Tensor = torch.unflatten(residual.square(), 1, (self.components, -1)).sum(1)
-        return total
+        return torch.unflatten(residual.square(), 1, (self.components, -1)).sum(1)
 
 
 class TwoViewModel(Residuals):

@@ -114,8 +114,7 @@ class PairScorer:
     def _gains(self, F_mat: Tensor, terms: Tensor) -> Tensor:
         """Return the term of each correspondence in each score before truncation at zero, (K, M)."""
         F = (F_mat / torch.linalg.vector_norm(F_mat, dim=(1, 2), keepdim=True)).float()
-        gains: Tensor = 1 - self.model.score_squares(F, terms, self.threshold)
-        return gains
+        return 1 - self.model.score_squares(F, terms, self.threshold)
 
 
 def finite_and_bounded(points1: Tensor, points2: Tensor, threshold: float) -> Tensor:
