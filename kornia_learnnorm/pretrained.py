@@ -7,6 +7,7 @@ import importlib
 import inspect
 import json
 from collections.abc import Callable, Collection, Mapping
+from contextlib import suppress
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
@@ -80,10 +81,9 @@ def load_module(
         raise ValueError(f"{path}: NaN or infinite weights in {', '.join(broken[:3])}")
     if any(value.is_meta for value in (*module.parameters(), *module.buffers())):
         raise ValueError(f"{path}: a constructor makes a tensor that state_dict does not hold: register it as a buffer")
-    try:
-        names = json.loads(text := metadata.get("trained_on", "[]"))
-    except ValueError:
-        names = None
+    names, text = None, metadata.get("trained_on", "[]")
+    with suppress(ValueError):
+        names = json.loads(text)
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ValueError(f"{path}: trained_on must be a JSON list of names, got {text[:80]!r}")
     module.trained_on = tuple(names)  # type: ignore[assignment]
@@ -107,18 +107,16 @@ def weights_format(name: str | Path) -> str | None:
     path = weights_path(name)
     if not path.is_file():
         return "" if Path(name).is_file() else None
-    try:
+    with suppress(SafetensorError):
         return _metadata(path).get("format", "")
-    except SafetensorError:
-        return ""
+    return ""
 
 
 def weights_model(name: str | Path) -> str:
     """Return the two-view model that weights name, "" where there is none; loading the file tells what is wrong."""
-    try:
+    with suppress(OSError, SafetensorError, ValueError, LookupError, TypeError):
         return str(json.loads(_metadata(weights_path(name))["architecture"])["model"])
-    except (OSError, SafetensorError, ValueError, LookupError, TypeError):
-        return ""
+    return ""
 
 
 def weights_path(name: str | Path) -> Path:
@@ -150,12 +148,9 @@ def name_part(part: Any, *modules: Any) -> str:
     module, name = getattr(part, "__module__", ""), getattr(part, "__name__", "")
     if any(getattr(known, name, None) is part for known in modules):
         return str(name)
-    with working_folder_importable():
-        try:
-            if module != "__main__" and getattr(importlib.import_module(module), name) is part:
-                return f"{module}.{name}"
-        except (ImportError, AttributeError, ValueError):
-            pass
+    with working_folder_importable(), suppress(ImportError, AttributeError, ValueError):
+        if module != "__main__" and getattr(importlib.import_module(module), name) is part:
+            return f"{module}.{name}"
     raise TypeError(f"{part!r} cannot be imported by its name: define it at the top level of a module, not in a script")
 
 
