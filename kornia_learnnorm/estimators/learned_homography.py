@@ -181,8 +181,7 @@ class LearnedHomography(LearnedLayer):
     def from_pretrained(cls, name: str | Path = "robust-homography") -> LearnedHomography:
         """Load a trained estimator in evaluation mode: ``"robust-homography"``, or the path of a ``.safetensors`` file.
 
-        FileNotFoundError if there are no such weights, with a list of those that ship; ValueError if the file is not
-        an estimator of this package or its tensors do not fit.
+        Errors are those of :meth:`~kornia_learnnorm.LearnedEightPoint.from_pretrained`.
         """
         return super().from_pretrained(name)  # configurations need the name of the class, not Self
 

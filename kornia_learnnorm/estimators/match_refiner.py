@@ -220,8 +220,7 @@ class MatchRefiner(nn.Module):
     def from_pretrained(cls, name: str | Path = "refiner") -> MatchRefiner:
         """Load a trained refiner in evaluation mode: ``"refiner"``, or the path of a ``.safetensors`` file.
 
-        FileNotFoundError if there are no such weights, with a list of those that ship; ValueError if the file is not
-        a refiner of this package or its tensors do not fit.
+        Errors are those of :meth:`~kornia_learnnorm.LearnedEightPoint.from_pretrained`.
         """
 
         def build(architecture: dict[str, Any]) -> MatchRefiner:

@@ -15,10 +15,7 @@ EVEN_ROOTS = {4: 1.1673039782614187, 5: 1.1347241384015194, 7: 1.096981557798559
 def sample_null_spaces(
     evidence: Evidence, weights: Tensor, order: Tensor, number: int, size: int
 ) -> tuple[Tensor, Tensor]:
-    """Return the null spaces (B, S, 9 - size, 3, 3) of minimal samples, and which have no larger one, (B, S) bool.
-
-    Samples are those of :func:`draw_matches`.
-    """
+    """Return the null spaces (B, S, 9 - size, 3, 3) of minimal samples, and which have no larger one, (B, S) bool."""
     basis, pivots = null_space(_sample_rows(evidence, weights, order, number, size).mT)
     determined = pivots.amin(-1) > MIN_PIVOT * pivots.amax(-1)
     return torch.unflatten(basis.mT, -1, (3, 3)).mT, determined
@@ -38,11 +35,10 @@ def _sample_rows(evidence: Evidence, weights: Tensor, order: Tensor, number: int
 
 
 def draw_matches(weights: Tensor, order: Tensor, number: int, size: int) -> Tensor:
-    """Return the correspondences of minimal samples, indices (B, number size), one sample after another.
+    """Return the correspondences of samples drawn by weights, indices (B, number size), one sample after another.
 
-    They are drawn by the weights (B, N), without a generator of random numbers.
-    ``order`` (B, N) sorts the correspondences by their weights. The samples are those of multiples of the powers of the
-    root of :math:`x^{d + 1} = x + 1` for d = ``size``, which spread evenly (M. Roberts, 2018).
+    ``order`` (B, N) sorts the correspondences by their weights (B, N). The samples are those of multiples of the powers
+    of the root of :math:`x^{d + 1} = x + 1` for d = ``size``, which spread evenly (M. Roberts, 2018).
     """
     shares = weights.gather(1, order).cumsum(1)
     shares = shares / shares[:, -1:]
