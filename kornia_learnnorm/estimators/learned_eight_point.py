@@ -1,7 +1,5 @@
 r"""The learned eight-point algorithm: a network weighs the correspondences and chooses the transforms, in stages."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -194,7 +192,7 @@ class LearnedEightPoint(LearnedLayer):
         self.rank2, self.learn_transforms = rank2, learn_transforms
 
     @classmethod
-    def from_pretrained(cls, name: str | Path = "robust-synthetic") -> LearnedEightPoint:
+    def from_pretrained(cls, name: str | Path = "robust-synthetic") -> "LearnedEightPoint":
         """Load a trained estimator for evaluation: ``"robust-synthetic"``, ``"robust"``, ``"robust-tiny"``, or a file.
 
         FileNotFoundError if there are no such weights, with a list of those that ship; ValueError if the file is not

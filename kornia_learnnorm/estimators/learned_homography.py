@@ -1,7 +1,5 @@
 r"""The learned homography: from matches of a plane, or of a camera that only rotates."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -178,7 +176,7 @@ class LearnedHomography(LearnedLayer):
         super().__init__(Homography(), width, depth, stages, refine_steps, samples)
 
     @classmethod
-    def from_pretrained(cls, name: str | Path = "robust-homography") -> LearnedHomography:
+    def from_pretrained(cls, name: str | Path = "robust-homography") -> "LearnedHomography":
         """Load a trained estimator in evaluation mode: ``"robust-homography"``, or the path of a ``.safetensors`` file.
 
         Errors are those of :meth:`~kornia_learnnorm.LearnedEightPoint.from_pretrained`.
@@ -188,7 +186,7 @@ class LearnedHomography(LearnedLayer):
     @classmethod
     def from_eight_point(
         cls, layer: LearnedEightPoint, stages: int = 2, refine_steps: int = 3, samples: int = 64
-    ) -> LearnedHomography:
+    ) -> "LearnedHomography":
         """Return an untrained estimator whose networks start from those of an estimator of fundamental matrices.
 
         Stages beyond those of ``layer`` are new.

@@ -1,7 +1,5 @@
 """Base class of the learned layers: networks predict weights and transforms of a DLT, in stages."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self
@@ -105,7 +103,7 @@ class LearnedLayer(MatchLayer):
 
         return load_module(name, FORMAT, "estimator", build, cls.model_name)
 
-    def start_from(self, layer: LearnedLayer) -> Self:
+    def start_from(self, layer: "LearnedLayer") -> Self:
         """Load the first networks of an estimator of fundamental matrices; weights of additional inputs are zero."""
         columns = torch.tensor([*range(POINT_FEATURES), *range(self.features, self.features + RESIDUAL_FEATURES)])
         for own, other in zip(self.networks, layer.networks, strict=False):

@@ -1,7 +1,5 @@
 r"""The learned relative pose of calibrated cameras: essential matrix, rotation and translation from matches."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 
@@ -97,7 +95,7 @@ class LearnedRelativePose(LearnedLayer):
         super().__init__(Essential(eye, eye), width, depth, stages, refine_steps, samples)
 
     @classmethod
-    def from_pretrained(cls, name: str | Path = "robust-pose-synthetic") -> LearnedRelativePose:
+    def from_pretrained(cls, name: str | Path = "robust-pose-synthetic") -> "LearnedRelativePose":
         """Load a trained estimator in evaluation mode: ``"robust-pose-synthetic"``, ``"robust-pose"``, or a file.
 
         Errors are those of :meth:`~kornia_learnnorm.LearnedEightPoint.from_pretrained`.
@@ -107,7 +105,7 @@ class LearnedRelativePose(LearnedLayer):
     @classmethod
     def from_eight_point(
         cls, layer: LearnedEightPoint, stages: int = 2, refine_steps: int = 5, samples: int = 64
-    ) -> LearnedRelativePose:
+    ) -> "LearnedRelativePose":
         """Return an untrained estimator whose networks start from those of an estimator of fundamental matrices.
 
         Their additional inputs, rays and distances in pixels, have no effect before training. Stages beyond those of

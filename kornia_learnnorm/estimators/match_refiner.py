@@ -1,7 +1,5 @@
 r"""The learned sub-pixel refinement of matches: both points move so that the patches around them agree."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -217,7 +215,7 @@ class MatchRefiner(nn.Module):
         save_module(path, self, FORMAT, {key: getattr(self, key) for key in ("patch_size", "width", "bound")})
 
     @classmethod
-    def from_pretrained(cls, name: str | Path = "refiner") -> MatchRefiner:
+    def from_pretrained(cls, name: str | Path = "refiner") -> "MatchRefiner":
         """Load a trained refiner in evaluation mode: ``"refiner"``, or the path of a ``.safetensors`` file.
 
         Errors are those of :meth:`~kornia_learnnorm.LearnedEightPoint.from_pretrained`.

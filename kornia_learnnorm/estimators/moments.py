@@ -5,8 +5,6 @@ Correspondences enter a step through the :math:`9 \times 9` matrix of the second
 thousands. Fundamental and essential matrices share all of it; the state says on which manifold the steps stay.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -32,15 +30,15 @@ class Evidence(NamedTuple):
     products: Tensor  # different entries of x1 x1^T and x2 x2^T, for the squared normals of lines, (B, 12, N)
 
     @classmethod
-    def from_points(cls, x1: Tensor, x2: Tensor) -> Evidence:
+    def from_points(cls, x1: Tensor, x2: Tensor) -> "Evidence":
         """Return the evidence of homogeneous points (B, 3, N)."""
         return cls(x1, x2, (x1[:, :, None] * x2[:, None]).flatten(1, 2), point_products(x1, x2))
 
-    def select(self, index: Tensor) -> Evidence:
+    def select(self, index: Tensor) -> "Evidence":
         """Return the correspondences of given indices (B, M)."""
         return Evidence(*[value.gather(2, index[:, None].expand(-1, value.shape[1], -1)) for value in self])
 
-    def single(self) -> Evidence:
+    def single(self) -> "Evidence":
         """Return the same in float32, which is enough to compare matrices."""
         return Evidence(*map(Tensor.float, self))
 

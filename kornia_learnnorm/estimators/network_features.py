@@ -4,8 +4,6 @@ Features don't change when both images are moved or scaled by one factor. The vi
 swapping them changes nothing but which one is called the first. Networks see the second upright to the first.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch
@@ -33,7 +31,7 @@ class CommonFrame(NamedTuple):
     swapped: Tensor  # whether the canonical order of the views is the second before the first, (B,) bool
 
     @classmethod
-    def from_points(cls, points1: Tensor, points2: Tensor, present: Tensor | None) -> CommonFrame:
+    def from_points(cls, points1: Tensor, points2: Tensor, present: Tensor | None) -> "CommonFrame":
         """Return the frame of correspondences (B, N, 2); ``present`` (B, N) is one for those that count, zero else.
 
         The view whose points spread less comes first: a camera that moves forward sees them spread.

@@ -4,8 +4,6 @@ Matrices move in coordinates that are Hartley's up to the scale of homogeneous v
 third coordinate as large as they are. Distances in them are those in pixels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -36,7 +34,7 @@ class RobustCost(NamedTuple):
     loss: Loss  # of squared distances
     relaxation: float = 1.0  # of a step; a bounded loss curves less than its weights say
 
-    def select(self, rows: Tensor) -> RobustCost:
+    def select(self, rows: Tensor) -> "RobustCost":
         """Return the cost of some of the matrices."""
         if len(self.x1) == 1:
             return self
@@ -55,7 +53,7 @@ class Optimum(NamedTuple):
     iterations: Tensor
     step: Tensor  # (B, P); zero after one that was refused
 
-    def map(self, function: Callable[..., Tensor], *others: Optimum) -> Optimum:
+    def map(self, function: Callable[..., Tensor], *others: "Optimum") -> "Optimum":
         """Return what a function makes of each tensor and its counterparts in others."""
         states = zip(self.state, *(other.state for other in others), strict=True)
         state = type(self.state)(*(function(*values) for values in states))
