@@ -68,7 +68,7 @@ def refine_fundamental(
             Hartley's coordinates.
         weights: optional non-negative weights of the losses, :math:`(B, N)` or :math:`(1, N)` as the points; zero means
             absent.
-        distance: the distance :math:`d`: ``"sampson"``, or ``"symmetric"`` (Fan et al., Eq. 7).
+        distance: the distance :math:`d`: ``"sampson"``, or ``"symmetric"`` (Fan et al., Eq. 8).
         loss: :math:`\rho` of squared distances: :func:`~kornia_learnnorm.estimators.robust_losses.squared_loss`,
             :class:`~kornia_learnnorm.Huber`, :class:`~kornia_learnnorm.Cauchy`,
             :class:`~kornia_learnnorm.GemanMcClure` or :class:`~kornia_learnnorm.Truncated`.

@@ -21,7 +21,7 @@ class SearchedNormalizer(ProblemNormalizer):
 
     :math:`T_i = B(p_i)\, T_i^{base}` with five parameters :math:`p_i` of
     :func:`~kornia_learnnorm.geometry.transforms.spd_transform` for every sample, from zero and within plus and minus 3.
-    Adam lowers the logarithm of the mean distance (Fan et al., Eq. 7) and the best parameters of all steps are kept.
+    Adam lowers the logarithm of the mean distance (Fan et al., Eq. 8) and the best parameters of all steps are kept.
 
     Use it as a limit to compare with, not as a method: it fits the sample's own points, noise included, and its result
     carries no gradient. It is a local search, so the true optimum may be lower still.

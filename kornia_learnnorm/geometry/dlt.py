@@ -26,7 +26,7 @@ def design_matrix(x1: Tensor, x2: Tensor) -> Tensor:
     r"""Stack the epipolar constraints into the DLT's design matrix.
 
     Row :math:`i` is :math:`x_{2,i} \otimes x_{1,i}`, so that row times the row-major :math:`\mathrm{vec}(F)` is
-    :math:`x_{2,i}^\top F x_{1,i}` (Fan et al., Eq. 3).
+    :math:`x_{2,i}^\top F x_{1,i}` (Fan et al., Eq. 2).
 
     Args:
         x1: homogeneous points of the first view with shape :math:`(*, N, 3)`.

@@ -37,7 +37,7 @@ class Fundamental(TwoViewModel):
 
     ``rank2`` is ``"projection"`` in Frobenius norm in normalised coordinates, or ``"optimal"`` correction, see
     :func:`~kornia_learnnorm.optimal_rank2`. ``distance`` is the residual of a correspondence: the ``"sampson"`` or
-    ``"symmetric"`` distance (Fan et al., Eq. 7). Other names are a ValueError.
+    ``"symmetric"`` distance (Fan et al., Eq. 8). Other names are a ValueError.
     """
 
     name = "fundamental"

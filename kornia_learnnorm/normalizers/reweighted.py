@@ -30,7 +30,7 @@ class ReweightedWhitening(ProblemNormalizer):
 
     Starts from the DLT's null vector :math:`F_0` and the weights
     :math:`w_i = 1 / \|(F_0^\top x_{2,i})_{1:2}\| + 1 / \|(F_0 x_{1,i})_{1:2}\|`, the factor from an algebraic residual
-    to the symmetric epipolar distance (Fan et al., Eq. 7). Each iteration finds the lines :math:`a, b` of the rank-2
+    to the symmetric epipolar distance (Fan et al., Eq. 8). Each iteration finds the lines :math:`a, b` of the rank-2
     correction, :math:`b \propto S_1^{-1} F_0^{-1} a` and :math:`a \propto S_2^{-1} F_0^{-\top} b`, and sets the weights
     of view 1 to :math:`w_i |a^\top x_{2,i}| / |b^\top x_{1,i}|`, of view 2 to its mirror image: iteratively reweighted
     least squares for the sum of absolute residuals. Both views are updated at the same time, so that swapping them

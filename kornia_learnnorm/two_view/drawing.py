@@ -61,7 +61,7 @@ def draw_pair(image1: Pixels, image2: Pixels, estimate: PairEstimate, path: str 
     """Draw the matches in image 1 and what the matrix says in image 2, and write the picture whole or not at all.
 
     Image 1 shows the inliers in blue, each with its motion to image 2, and the outliers in red. Image 2 shows the
-    epipolar lines of a random subset of the inliers, line and point in one colour (as Fan et al., Figure 10), or the
+    epipolar lines of a random subset of the inliers, line and point in one colour (as Fan et al., Figure 6), or the
     mean of it and image 1 as the homography moves it. The images are grey or RGB, uint8, and may be reduced. The suffix
     of ``path`` decides the format.
     """

@@ -162,7 +162,7 @@ def test_seed_decides(store):
 
 
 def test_filter_agrees_with_numpy(store, monkeypatch):
-    """The un-normalised eight-point algorithm and Eq. 7 in NumPy."""
+    """The un-normalised eight-point algorithm and Eq. 8 in NumPy."""
     samples = draw_samples(store, seeded())
     points = samples.points1.double(), samples.points2.double()
     expected = epipolar_distances(*points, eight_point(*points, np.eye(3), np.eye(3))).mean(-1)

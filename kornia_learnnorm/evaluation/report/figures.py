@@ -42,7 +42,7 @@ SETTINGS: dict[str, Any] = {
 Colors = dict[str, str]  # by the method
 DOTS: dict[str, Any] = {"marker": "o", "markersize": 3}
 MAX_FRAMES = 20  # image pairs on the axis of Figure 4a
-RHO_WINDOW = 100  # successive samples in a mean of Figure 13
+RHO_WINDOW = 100  # successive samples in a mean of Figure 9
 NORMALISATIONS = ("none", "Hartley", "whitening", "reweighted", "paper", "crossview", "searched")
 
 
@@ -140,8 +140,8 @@ DRAWINGS: dict[str, tuple[str, Callable[[Figure, RunCell, Colors], str]]] = {
     "4a": ("Error by frame", _per_frame),
     "4b": ("Distribution of errors", _distribution),
     "5": ("Normalised distances", _distances),
-    "12": ("Condition numbers", _conditions),
-    "13": ("Singularity ratio", _rho),
+    "8": ("Condition numbers", _conditions),
+    "9": ("Singularity ratio", _rho),
 }
 
 

@@ -67,8 +67,9 @@ def _better_rates(run: Run, cells: list[RunCell], baseline: str) -> Table:
         "and drawn: those with a mean distance without normalisation of "
         f"{run.about['max_residual']:g} px or more are not used."
     )
-    papers = [papers_data(run.about["stores"][cell.store]) for cell in cells] if baseline == BASELINE else []
-    if protocol == "filtered" and any(papers):
+    papers = [papers_data(run.about["stores"][cell.store]) for cell in cells]
+    papers = papers if baseline == BASELINE and protocol == "filtered" else []
+    if any(papers):
         rows += [
             ["Fan et al., as printed", *(Number(values[p], ".2f") if p in values else "" for p in papers), train]
             for train, values in TABLE1.items()
