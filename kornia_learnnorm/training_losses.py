@@ -17,7 +17,7 @@ MAX_DISTANCE = 1e4  # pixels; larger distances count as this and send no gradien
 class EpipolarLoss(nn.Module):
     r"""Residuals on the sample's own points and on held-out points: the self-supervised loss of Fan et al.
 
-    With ``log=False``, the mean residual of a sample is averaged over the batch (Fan et al., Eq. 7). With ``log=True``,
+    With ``log=False``, the mean residual of a sample is averaged over the batch (Fan et al., Eq. 8). With ``log=True``,
     the logarithm of this mean is averaged, so that a few bad samples do not dominate. The logarithm of held-out
     residuals is taken of each correspondence.
 
@@ -82,6 +82,8 @@ class EpipolarLoss(nn.Module):
 def _distances(residual: Residual, points1: Tensor, points2: Tensor, M: Tensor, most: float = MAX_DISTANCE) -> Tensor:
     check_pairs(points1, points2, ["B", "N", "2"])
     check_number_of_matrices("F_mat", M, len(points1))
+    if points1.shape[1] == 0:
+        raise ValueError("the mean distance needs a correspondence, got none")
     # In float64: next to an epipole, the square of a line's normal leaves the range of float32.
     return residual(*(value.to(solve_dtype(M.device)) for value in (points1, points2, M))).clamp(max=most)
 
@@ -89,7 +91,7 @@ def _distances(residual: Residual, points1: Tensor, points2: Tensor, M: Tensor, 
 class BoundedEpipolarLoss(nn.Module):
     r"""Mean of :math:`d^2 / (d^2 + s^2)` over matches with outliers, for training without labels.
 
-    :math:`d` is the symmetric epipolar distance (Fan et al., Eq. 7). A match far from its lines costs at most one
+    :math:`d` is the symmetric epipolar distance (Fan et al., Eq. 8). A match far from its lines costs at most one
     and has little gradient, so the matrix that explains most matches has the least loss.
 
     Args:

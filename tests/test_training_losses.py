@@ -97,6 +97,7 @@ class TestEpipolarLoss:
         *points, F_mat = rows([1.0, 2.0], [3.0, 0.0])
         raises(TypeError, "points1 .* got torch.float16", LogEpipolarLoss(), points[0].half(), points[1], F_mat)
         raises(ValueError, "one matrix per set", EpipolarLoss(), *points, F_mat[:1])
+        raises(ValueError, "needs a correspondence, got none", EpipolarLoss(), *(p[:, :0] for p in points), F_mat)
         raises(ValueError, r"F_mat .*\(B, 3, 3\), got \[2, 1, 3, 3\]", EpipolarLoss(), *points, F_mat[:, None])
 
     @pytest.mark.parametrize("heldout", [(), (None, None), (torch.zeros(1, 3, 2), None), (torch.zeros(1, 0, 2),) * 2])

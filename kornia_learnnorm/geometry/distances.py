@@ -36,7 +36,7 @@ def _check(points1: Tensor, points2: Tensor, M: Tensor, name: str = "F_mat") -> 
 
 
 def symmetric_epipolar_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
-    r"""Return the sum of the distances of both points to their epipolar lines (Fan et al., Eq. 7).
+    r"""Return the sum of the distances of both points to their epipolar lines (Fan et al., Eq. 8).
 
     :math:`|x_2^\top F x_1| \left( 1 / \|(F^\top x_2)_{1:2}\| + 1 / \|(F x_1)_{1:2}\| \right)`. It is not
     ``kornia.geometry.epipolar.symmetrical_epipolar_distance``, which adds the squares.
@@ -140,6 +140,8 @@ def transfer_distance(points1: Tensor, points2: Tensor, H_mat: Tensor) -> Tensor
         H_mat = H_mat.expand(len(points1), 3, 3)
     with without_autocast(points1):
         distance: Tensor = symmetric_transfer_error(points1, points2, H_mat, squared=False)
+    unknown = (points1 + points2).isnan().any(-1) | H_mat.isnan().flatten(-2).any(-1, keepdim=True)
+    distance = distance.masked_fill(unknown, torch.nan)  # which Kornia takes for the distance under a singular matrix
     return distance[0] if single else distance
 
 

@@ -8,7 +8,7 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from kornia.geometry.epipolar import essential_from_fundamental, motion_from_essential
 from torch import Tensor
 
-from kornia_learnnorm.geometry.checks import check_mask, check_tensor, solve_dtype
+from kornia_learnnorm.geometry.checks import check_cameras, check_mask, check_tensor, solve_dtype
 
 
 def relative_pose(
@@ -37,8 +37,8 @@ def relative_pose(
     Raises:
         TypeError: if a tensor is not floating-point or the mask is not boolean.
         ShapeError: if a shape is wrong.
-        ValueError: if the points do not pair up, the batches differ, or the mask does not fit the points.
-        torch.linalg.LinAlgError: if a camera is singular.
+        ValueError: if the points do not pair up, the batches differ, the mask does not fit the points, or a camera is
+            not finite and invertible with a last row of (0, 0, w > 0).
 
     Reference:
         R. Hartley, A. Zisserman, Multiple View Geometry in Computer Vision, 2004, section 9.6.
@@ -51,7 +51,8 @@ def relative_pose(
         True
     """
     check_tensor("F_mat", F_mat, ["B", "3", "3"])
-    K1, K2 = (K.expand(len(F_mat), 3, 3) if isinstance(K, Tensor) and K.shape == (3, 3) else K for K in (K1, K2))
+    check_cameras(K1, K2, len(F_mat))
+    K1, K2 = (K.expand(len(F_mat), 3, 3) for K in (K1, K2))
     named = {"F_mat": F_mat, "K1": K1, "K2": K2, "points1": points1, "points2": points2}
     for name, value in named.items():
         check_tensor(name, value, ["B", "N", "2"] if name.startswith("points") else ["B", "3", "3"])

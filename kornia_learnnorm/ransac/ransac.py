@@ -81,7 +81,7 @@ class RANSAC(nn.Module):
             the best matrix so far has all inliers; 1 draws all ``max_samples`` samples. By default 0.999999, because a
             sample must have little noise, too; 0.9999 for a homography; and 0.999 with cameras, which reduce the effect
             of noise.
-        distance: ``"sampson"``, or ``"symmetric"`` (Fan et al., Eq. 7).
+        distance: ``"sampson"``, or ``"symmetric"`` (Fan et al., Eq. 8).
         rank2: how the singularity constraint is enforced on samples of eight: ``"projection"`` in the normaliser's
             coordinates (Hartley's when not given), the default with a ``normalizer``, or ``"optimal"`` correction.
             Matrices of samples of seven are singular.
@@ -139,6 +139,8 @@ class RANSAC(nn.Module):
                 raise ValueError("model 'essential' is 'fundamental' called with the cameras K1 and K2")
             check_choice("model", model, ("fundamental", "homography"))
             model = Homography(distance) if model == "homography" else Fundamental(rank2, distance)
+        if not isinstance(model, TwoViewModel):
+            raise TypeError(f"model must be a name or a TwoViewModel, got {model!r}")
         self.model = model
         self.normalizer = Hartley() if normalizer is None and rank2 == "projection" else normalizer
         self.rank2: Rank2Method = rank2
@@ -203,7 +205,7 @@ class RANSAC(nn.Module):
         """
         check_cameras(K1, K2)
         if K1 is not None and not isinstance(self.model, Fundamental):
-            text = f"K1 and K2 make a fundamental matrix an essential one, got a {self.model.name}"
+            text = f"K1 and K2 make a fundamental matrix an essential one, got model {self.model.name}"
             raise ValueError(f"{text}: leave them out")
         cameras = None if K1 is None or K2 is None else (K1, K2)
         least = self.model.min_points if cameras is None else Essential.sample_size

@@ -128,6 +128,9 @@ class TestTransferDistance:
         assert transfer_distance(points1.float(), points2.float(), H.float()).dtype == torch.float32
         one, shared = (transfer_distance(*(p[i] for p in (points1, points2)), H[0]) for i in (0, slice(1)))
         np.testing.assert_allclose([one, shared[0]], expected[[0, 0]], rtol=1e-9)
+        points1[0, 1, 0] = H[1, 2, 2] = torch.nan
+        unknown = transfer_distance(points1, points2, H).isnan()
+        assert (unknown.sum(1)[:2].tolist(), unknown[0, 1], unknown[1].all()) == ([1, len(unknown[1])], True, True)
 
     def test_gradcheck(self):
         values = [v.requires_grad_() for v in (uniform(2, 5, 2), uniform(2, 5, 2, seed=1), 1 + uniform(2, 3, 3))]

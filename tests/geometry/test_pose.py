@@ -87,11 +87,13 @@ class TestRelativePose:
             (lambda F, K1, K2, a, b: (F.int(), K1, K2, a, b), TypeError, "F_mat must be .* got torch.int32"),
             (lambda F, K1, K2, a, b: (F, K1, K2, a.tolist(), b), TypeError, "points1 must be .* <class 'list'>"),
             (lambda F, K1, K2, a, b: (F[0], K1, K2, a, b), ShapeError, "shape"),
-            (lambda F, K1, K2, a, b: (F, K1[:, :2], K2, a, b), ShapeError, "shape"),
+            (lambda F, K1, K2, a, b: (F, K1[:, :2], K2, a, b), ValueError, "shape"),
             (lambda F, K1, K2, a, b: (F, K1, K2, a[:, :9], b), ValueError, "must pair up"),
-            (lambda F, K1, K2, a, b: (F, K1[:1], K2, a, b), ValueError, "one batch, got {'F_mat': 3, 'K1': 1"),
+            (lambda F, K1, K2, a, b: (F, K1[:2], K2, a, b), ValueError, r"K1 must have shape .* got \[2, 3, 3\]"),
             (lambda F, K1, K2, a, b: (F, K1, K2, a, b, a[..., 0]), TypeError, "mask must be a boolean tensor"),
             (lambda F, K1, K2, a, b: (F, K1, K2, a, b, a[0] > 0), ValueError, r"shape \[3, 10\] .*got \[10, 2\]"),
-            (lambda F, K1, K2, a, b: (F, 0 * K1, K2, a, b), torch.linalg.LinAlgError, "singular"),
+            (lambda F, K1, K2, a, b: (F, 0 * K1, K2, a, b), ValueError, "K1 must be finite and invertible"),
+            (lambda F, K1, K2, a, b: (F, K1, K2.mT, a, b), ValueError, "K2 .* transposed"),
+            (lambda F, K1, K2, a, b: (F, K1, K2, a[:2], b[:2]), ValueError, "one batch, got {'F_mat': 3, 'K1': 3"),
         ]:
             raises(error, message, relative_pose, *change(*pair("orbit", 3, 10)[0]))

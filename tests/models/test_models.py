@@ -125,7 +125,7 @@ def test_ransac():
 
 def test_wrong_options():
     points, eye = uniform(20, 2), torch.eye(3)
-    with pytest.raises(ValueError, match=r"K1 and K2 .* got a homography"):
+    with pytest.raises(ValueError, match=r"K1 and K2 .* got model homography"):
         kln.RANSAC(model="homography")(points, points, K1=eye, K2=eye)
     raises(ValueError, r"'fundamental' or 'homography', got 'affine'", kln.RANSAC, model="affine")
     raises(ValueError, r"'sampson' or 'symmetric', got 'one-way'", Homography, "one-way")

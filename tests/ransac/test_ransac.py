@@ -110,6 +110,7 @@ class TestExceptions:
             *(({"seed": seed}, TypeError, f"seed must be .* got {seed!r}") for seed in ("a", True)),
             *(({"normalizer": n}, TypeError, end) for n, end in (("a", "got 'a'$"), ("homography", "model="))),
             ({"inl_th": "1"}, TypeError, "inl_th must be a number, got '1'"),
+            ({"model": kln.Hartley()}, TypeError, r"model must be a name or a TwoViewModel, got Hartley"),
         ]:
             raises(error, message, RANSAC, **wrong)
 

@@ -130,7 +130,8 @@ def measure(pair: EvaluatedPair, F_mat: Tensor, threshold: float) -> dict[str, f
     """Return ``inliers``, ``f1``, ``error`` (px) and errors of the pose (degrees) of a matrix, NaN where unknown."""
     x1, x2 = pair.points1, pair.points2
     near = symmetric_epipolar_distance(x1, x2, F_mat) < INLIER_THRESHOLD
-    pose = relative_pose(F_mat[None], pair.K[:1], pair.K[1:], x1[None], x2[None], near[None])
+    K1, K2 = torch.where(pair.K.isnan(), torch.eye(3).to(pair.K), pair.K)  # any, where the true pose is unknown
+    pose = relative_pose(F_mat[None], K1, K2, x1[None], x2[None], near[None])
     known = (angle_error_mat(pair.R, pair.R) + angle_error_vec(pair.t, pair.t)).isfinite()
     results = {
         "inliers": (finite_distance(x1, x2, F_mat) < threshold).double().mean(),

@@ -87,6 +87,7 @@ def _predict_batch(method: Method, samples: MatchSets, store: CorrespondenceStor
     T1, T2 = normalizing_transforms(method.normalizer, problem)
     F_mat = method.solve(problem, T1, T2)
     K, R, t = (torch.from_numpy(part)[samples.pair] for part in (store.K, store.R, store.t))
+    K = torch.where(K.isnan(), torch.eye(3).to(K), K)  # unknown cameras, whose true pose is unknown too
     found = relative_pose(F_mat, K[:, 0], K[:, 1], x1, x2)
     return {
         "F_mat": F_mat,
