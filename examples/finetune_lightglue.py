@@ -137,6 +137,8 @@ def main(args: Sequence[str] | None = None) -> tuple[float, float]:
     options = parser.parse_args(args)
     layer, lightglue = pretrained()
     pairs = read_pairs(lightglue, options.folders)
+    if len(pairs) < 2:
+        parser.error(f"two or more pairs of at least {MIN_MATCHES} matches expected in the folders, got {len(pairs)}")
     torch.manual_seed(0)
     weigh = MatchWeights()
     before = held_out_loss(layer, weigh, pairs[::6])

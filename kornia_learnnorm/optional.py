@@ -14,7 +14,7 @@ def import_extra(module: str, extra: str, purpose: str) -> Any:
         return importlib.import_module(module)
     except ImportError as error:
         advice = f"run pip install 'kornia-learnnorm[{extra}]', in a checkout pip install '.[{extra}]'"
-        raise ImportError(f"{purpose} needs {module}: {advice}") from error
+        raise ImportError(f"{purpose} needs {error.name or module}: {advice}") from error
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """Callbacks: checkpoints, expected time, export of the trained weights, and predictions to a file."""
 
+import shlex
 import signal
 import threading
 import time
@@ -66,7 +67,7 @@ class Checkpoints(ModelCheckpoint):
         self._restore_handler()
         if trainer.state.fn == TrainerFn.FITTING and self._started:
             last = self.last_model_path
-            how = f"to go on, repeat the command with --ckpt_path {last}"
+            how = f"to go on, repeat the command with --ckpt_path {shlex.quote(last)}"
             how = how if Path(last).is_file() else "no checkpoint was written"
             _print_above_bar(f"stopped at step {trainer.global_step}; {how}")
 

@@ -28,7 +28,7 @@ hypothesis.settings.load_profile("package")
 
 TESTS = Path(__file__).parent
 NUMERICAL = {"geometry", "models", "normalizers", "estimators", "ransac", "metrics"}  # folders
-NUMERICAL |= {"test_training_losses.py", "test_diagnostics.py", "test_search.py"}
+NUMERICAL |= {"test_training_losses.py", "test_diagnostics.py", "test_searched_normalizer.py"}
 NUMERICAL |= {"test_parallax.py", "test_repeated_texture.py"}
 # Tests that do not depend on the order of rounding: shapes, errors, files, random draws, and derivatives against
 # differences, whose tolerance is far above it.

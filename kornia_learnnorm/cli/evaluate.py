@@ -1,6 +1,7 @@
 """Better rates and errors of methods on stores of correspondences: ``learnnorm evaluate``."""
 
 import argparse
+import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -91,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
         _print_tables(args, recorded, tables)
     if further := [name for name in recorded.about["methods"] if name not in map(short_name_of, methods)]:
         print(f"{args.out} also holds, from before: {', '.join(further)}", file=sys.stderr)
-    done = f"\nwrote {args.out}; learnnorm report {args.out} makes tables and figures of it"
+    done = f"\nwrote {args.out}; learnnorm report {shlex.quote(args.out)} makes tables and figures of it"
     print(done, file=sys.stderr if args.json == "-" else sys.stdout)
     return 0
 

@@ -1,6 +1,7 @@
 """The command ``learnnorm robust``: robust estimators on stores."""
 
 import argparse
+import shlex
 import sys
 from pathlib import Path
 
@@ -40,5 +41,5 @@ def run(args: argparse.Namespace) -> int:
     options = {name: getattr(args, name) for name in DEFAULT_OPTIONS}
     if missing := record_robust(args.out, stores, args.estimators, options, args.redo, args.command_line):
         print(f"left out, since not installed: {', '.join(missing)}", file=sys.stderr)
-    print(f"wrote {args.out}; learnnorm report {args.out} makes its tables and pictures")
+    print(f"wrote {args.out}; learnnorm report {shlex.quote(str(args.out))} makes its tables and pictures")
     return 0

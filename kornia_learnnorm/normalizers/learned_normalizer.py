@@ -15,7 +15,7 @@ from kornia_learnnorm.geometry.transforms import spd_transform, transform_points
 from kornia_learnnorm.normalizers import closed_form, reweighted
 from kornia_learnnorm.normalizers.networks import crossview, paper
 from kornia_learnnorm.normalizers.networks.crossview import CrossViewNetwork
-from kornia_learnnorm.normalizers.normalizer import Normalizer, ProblemNormalizer, transforms_of
+from kornia_learnnorm.normalizers.normalizer import Normalizer, ProblemNormalizer, check_normalizer, transforms_of
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 
 BASES = (closed_form, reweighted)  # modules of the bases that a file may name
@@ -64,6 +64,8 @@ class LearnedNormalizer(ProblemNormalizer):
         super().__init__()
         if max_points is not None:
             check_whole_number("max_points", max_points, 8)
+        if base is not None:
+            check_normalizer(base)
         self.base: Normalizer = ReweightedWhitening() if base is None else base
         self.network = CrossViewNetwork() if network is None else network
         self.transform = transform
@@ -94,7 +96,7 @@ class LearnedNormalizer(ProblemNormalizer):
             raise ValueError(f"a network must return (params1, params2), got {got}")
         if any(part.ndim != 2 for part in params):
             raise ValueError(f"params1 and params2 must have shape (B, P), got {[[*part.shape] for part in params]}")
-        return self.transform(params[0]) @ T1, self.transform(params[1]) @ T2
+        return self.transform(params[0].to(T1)) @ T1, self.transform(params[1].to(T2)) @ T2
 
     def extra_repr(self) -> str:
         """Return the parameters."""

@@ -14,6 +14,7 @@ from kornia_learnnorm.geometry.pose import in_front, relative_pose
 from kornia_learnnorm.geometry.transforms import transform_fundamental
 from kornia_learnnorm.metrics.statistics import median
 from kornia_learnnorm.models.essential import nearest_essential
+from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import INLIER_THRESHOLD
 from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.ransac.scoring import finite_and_bounded
@@ -96,6 +97,7 @@ def estimate_matches(
         ValueError: if shapes do not pair up, a value is out of range, over a fifth of the points lies outside of its
             image, or a camera is missing or not invertible.
     """
+    import_extra("cv2", "images", "estimate_matches")
     check_settings(threshold, seed, layer, model)
     cameras = read_cameras(K1, K2)
     points1, points2, scores = read_matches(points1, points2, scores)

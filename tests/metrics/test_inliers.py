@@ -17,7 +17,6 @@ METRICS = {"f1": f1_score, "error": epipolar_error}
 
 
 def by_hand(points1, points2, F, true, threshold):
-    """Both of one pair, precision and recall apart."""
     estimated, actual = (epipolar_distances(points1, points2, matrix) for matrix in (F, true))
     chosen, right = ({i for i, d in enumerate(ds) if d < threshold} for ds in (estimated, actual))
     hits, f1 = len(chosen & right), NAN

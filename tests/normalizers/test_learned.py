@@ -9,7 +9,7 @@ import torch
 from kornia.geometry.epipolar import normalize_points
 from pairwise import pairwise
 from references import epipolar_distances, mapped, signless
-from scenes import DTYPES, correspondences, last_layer, paper, rewrite_weights, shaken, small, uniform
+from scenes import DTYPES, correspondences, last_layer, paper, raises, rewrite_weights, shaken, small, uniform
 from torch import nn
 
 import kornia_learnnorm as kln
@@ -181,8 +181,9 @@ class TestMaxPoints:
         assert LearnedNormalizer.from_pretrained(file).max_points == 9
         assert LearnedNormalizer.from_pretrained("paper").max_points is None  # a file without it
         for number in (7, 8.5):
-            with pytest.raises(ValueError, match=rf"max_points must be a whole number, at least 8, got {number}"):
-                LearnedNormalizer(max_points=number)
+            message = rf"max_points must be a whole number, at least 8, got {number}"
+            raises(ValueError, message, LearnedNormalizer, max_points=number)
+        raises(TypeError, "normalizer must be a module or function, got 'Hartley'", LearnedNormalizer, "Hartley")
 
 
 BIAS = "network.set_network.head.2.bias"

@@ -18,7 +18,6 @@ from kornia_learnnorm.evaluation.tables import Number, Table, tables_as_json
 
 
 def as_text(rows):
-    """The cells of a table as it is printed."""
     return [[*map(str, row)] for row in rows]
 
 

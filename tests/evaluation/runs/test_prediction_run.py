@@ -106,8 +106,6 @@ def test_a_store_that_joins_later_changes_no_number(copied, command, tmp_path):
 
 
 class TestOwnCode:
-    """Normalisers in the folder that the command is called in."""
-
     GOOD = "from kornia_learnnorm import Whitening as Mine\n"
 
     @pytest.fixture(autouse=True)

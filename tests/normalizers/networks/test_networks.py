@@ -48,7 +48,6 @@ def numpy_features(net, points, weights=None):
 
 
 def numpy_params(net, points, weights=None):
-    """The parameters of one view of one sample."""
     state, M = {name: value.numpy() for name, value in net.state_dict().items()}, numpy_features(net, points, weights)
     kernel, bias = state["convolution.weight"][:, 0], state["convolution.bias"]
     rows, columns = range(M.shape[0] - 2), range(0, M.shape[1] - 2, 4)
