@@ -1,5 +1,5 @@
 # The versions of the lock, built without a network:
-#   pip download --requirement requirements.lock --dest wheels
+#   pip download --requirement requirements.lock --dest wheels    # with Python 3.11 on Linux
 #   docker build --network none --tag learnnorm .
 #   docker run --rm --volume $PWD:/work learnnorm estimate left.jpg right.jpg
 FROM python:3.11-slim
