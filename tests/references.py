@@ -1,10 +1,9 @@
 """References in NumPy, comparisons that know about sign and scale, and checks of gradients and errors."""
 
 import numpy as np
-import pytest
 import torch
 from kornia.core.exceptions import ShapeError
-from scenes import uniform
+from scenes import raises, uniform
 from torch import Tensor
 
 
@@ -199,8 +198,7 @@ def derivative(function):
 def check_refuses(call, least: int = 8) -> None:
     """Check that a function of correspondences and weights raises the right error for every kind of wrong ones."""
     for points1, points2, weights, error, message in _wrong_correspondences(least):
-        with pytest.raises(error, match=message):
-            call(points1, points2, weights)
+        raises(error, message, call, points1, points2, weights)
 
 
 WRONG_MATRICES = [  # with two sets of points

@@ -421,8 +421,7 @@ class TestExceptions:
             ((torch.zeros(3, 3), K), "K1 must be finite and invertible"),
             ((K, K.expand(5, 3, 3)), "K2 must have shape"),
         ]:
-            with pytest.raises(ValueError, match=message):
-                LAYERS["pose"]()(points, points, *cameras)
+            raises(ValueError, message, LAYERS["pose"](), points, points, *cameras)
 
     def test_options(self):
         shared = [({"width": 0}, "width must be"), ({"depth": 1.5}, "depth must be .* 1.5")]

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 from references import mapped
-from scenes import uniform
+from scenes import raises, uniform
 from torch.autograd import gradcheck, gradgradcheck
 
 from kornia_learnnorm.geometry.transforms import affine_transform, paper_transform, spd_transform
@@ -85,5 +85,4 @@ def test_wrong_shapes():
         (paper_transform, [(2, 5)], r"\[2, 5\]"),
         *((spd_transform, [(2, n)], rf"3 or 5 parameters a view, got shape \[2, {n}\]") for n in (0, 2, 4, 6)),
     ]:
-        with pytest.raises((ShapeError, ValueError), match=message):
-            function(*map(torch.zeros, shapes))
+        raises((ShapeError, ValueError), message, function, *map(torch.zeros, shapes))

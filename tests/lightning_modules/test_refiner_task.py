@@ -129,8 +129,7 @@ def test_labels_take_the_place_of_matrices_where_they_are_known(folder):
     torch.testing.assert_close(found[0], true_distance(sets, *points)[0], rtol=1e-3, atol=1e-3)  # cameras are float32
     without = HeldOutLoss(kln.EightPoint()).distances(sets, *points)
     torch.testing.assert_close(found[1], without[1])
-    with pytest.raises(ValueError, match="sets with cameras"):
-        HeldOutLoss(labels=True).distances(sets._replace(K1=None), *points)
+    raises(ValueError, "sets with cameras", HeldOutLoss(labels=True).distances, sets._replace(K1=None), *points)
 
 
 @pytest.mark.parametrize("options", [{}, {"detach": True}, {"estimator": kln.RANSAC(seed=0)}])

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 from references import epipolar_distances
-from scenes import scenes, seeded
+from scenes import raises, scenes, seeded
 
 from kornia_learnnorm.metrics.inliers import epipolar_error, f1_score
 
@@ -87,8 +87,7 @@ class TestAll:
             *((lambda *p, t=t: (*p, t), ValueError, f"must be positive, got {t}") for t in (0.0, -1.0, NAN)),
         ]:
             points1, points2, F, true, *rest = change(*pairs())
-            with pytest.raises(error, match=message):
-                METRICS[name](points1, points2, F, true, *(rest or [1.0]))
+            raises(error, message, METRICS[name], points1, points2, F, true, *(rest or [1.0]))
 
 
 def test_by_rows():

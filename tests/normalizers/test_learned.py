@@ -254,8 +254,6 @@ def test_parts_that_cannot_be_saved_leave_the_file_as_it_was(file):
 
 
 def test_wrong_targets(tmp_path):
-    with pytest.raises(FileNotFoundError, match="nowhere"):
-        small().save_pretrained(tmp_path / "nowhere" / "weights.safetensors")
+    raises(FileNotFoundError, "nowhere", small().save_pretrained, tmp_path / "nowhere" / "weights.safetensors")
     (tmp_path / "weights.safetensors").mkdir()
-    with pytest.raises(ValueError, match="not a regular file"):
-        small().save_pretrained(tmp_path / "weights.safetensors")
+    raises(ValueError, "not a regular file", small().save_pretrained, tmp_path / "weights.safetensors")

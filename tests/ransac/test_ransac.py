@@ -126,8 +126,7 @@ class TestExceptions:
             (POINTS, POINTS, {"weights": torch.full((20,), NAN)}, ValueError, "finite and not negative"),
             (POINTS, POINTS, {"K1": torch.eye(3)[None]}, ValueError, r"K1 .* got (only K1|\[1, 3, 3\])"),
         ]:
-            with pytest.raises(error, match=message):
-                RANSAC()(points1, points2, **cameras | change)
+            raises(error, message, RANSAC(), points1, points2, **cameras | change)
 
 
 class TestAccuracy:
