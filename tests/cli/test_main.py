@@ -8,6 +8,7 @@ import os
 import re
 import shlex
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -201,6 +202,8 @@ DATA = "data: {{{}: {{class_path: kornia_learnnorm.data.training_samples.StoreSa
         (["fit", "--config", "crossview", *SMALL], "", "the environment variable LEARNNORM_DATA, named in "),
         (["estimate", "none1.png", "none2.png"], "", "none1.png"),
         (["estimate", "a.png", "b.png", f"--seed={2**63}"], "", f"seed must lie in [0, 2^63), got {2**63}"),
+        *((["demo", f"--port={n}"], "", f"from 1 to 65535 expected, got {n}") for n in (0, -1, 65536)),
+        (["demo", "--matcher", "lightglue"], "", "keynet, got sift"),
         (["fit"], "", "give one by --config, a file or one of crossview, "),
         (["validate"], "", "for example learnnorm validate --config crossview-synthetic --ckpt_path "),
         (["fit", "crossview"], "", "'crossview'; a configuration is given by --config crossview"),
@@ -226,6 +229,12 @@ def test_errors_are_one_line_and_exit_code_2(arguments, bad, message, tmp_path, 
     refused(arguments, message)
     assert [path.name for path in tmp_path.iterdir()] == ["bad.yaml"]
     assert not [w for w in recwarn if "LightningCLI" in str(w.message)]
+
+
+def test_a_port_in_use(refused):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        refused(["demo", "--no-browser", f"--port={port}"], f"--port {port}: cannot listen there")
 
 
 @pytest.mark.parametrize(
