@@ -191,21 +191,17 @@ class TestCrossViewNetwork:
 class TestFeatures:
     @pytest.mark.parametrize(("features", "sees"), [("own", False), ("both", True), ("epipolar", True)])
     @pytest.mark.parametrize("num_points", [8, 20])
-    def test_the_other_view(self, features, sees, num_points):
+    def test_the_other_view_and_who_corresponds_to_whom(self, features, sees, num_points):
         net, (points1, points2) = crossview(features=features), whitened("handheld", 6, num_points)
         params1, params2 = net(points1, points2)
         other = whitened("driving", 6, num_points, seed=1)[1]
         (found1, moved2), (moved1, found2) = net(points1, other), net(other, points2)
         for found, expected in [(found1, params1), (found2, params2)]:
             assert torch.allclose(found, expected, rtol=1e-12) is not sees
+        for found, expected in zip(net(points1, points2.roll(1, 1)), (params1, params2), strict=True):
+            assert torch.allclose(found, expected, rtol=1e-10) is not sees
         for moved, before in [(moved1, params1), (moved2, params2)]:
             assert not torch.isclose(moved, before, atol=1e-4).all(-1).any()
-
-    @pytest.mark.parametrize(("features", "sees"), [("own", False), ("both", True), ("epipolar", True)])
-    def test_who_corresponds_to_whom(self, features, sees):
-        net, (points1, points2) = crossview(features=features), whitened()
-        for found, expected in zip(net(points1, points2.roll(1, 1)), net(points1, points2), strict=True):
-            assert torch.allclose(found, expected, rtol=1e-10) is not sees
 
     @pytest.mark.parametrize("name", ["Own", None])
     def test_unknown(self, name):
