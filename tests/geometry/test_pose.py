@@ -44,7 +44,8 @@ class TestRelativePose:
         K1, K2, points1, points2 = rest
         R, t = relative_pose(F, *rest)
         order = torch.randperm(25, generator=torch.Generator().manual_seed(seed))
-        for found in (relative_pose(factor * F, *rest), relative_pose(F, K1, K2, points1[:, order], points2[:, order])):
+        scaled = relative_pose(factor * F, 2 * K1, 1e-3 * K2, points1, points2)
+        for found in (scaled, relative_pose(F, K1, K2, points1[:, order], points2[:, order])):
             torch.testing.assert_close(found, (R, t), rtol=0, atol=1e-8, equal_nan=True)
         back = relative_pose(F.mT, K2, K1, points2, points1)  # the way from the second camera to the first
         expected = (R.mT, -(R.mT @ t[..., None])[..., 0])
@@ -92,8 +93,11 @@ class TestRelativePose:
             (lambda F, K1, K2, a, b: (F, K1[:2], K2, a, b), ValueError, r"K1 must have shape .* got \[2, 3, 3\]"),
             (lambda F, K1, K2, a, b: (F, K1, K2, a, b, a[..., 0]), TypeError, "mask must be a boolean tensor"),
             (lambda F, K1, K2, a, b: (F, K1, K2, a, b, a[0] > 0), ValueError, r"shape \[3, 10\] .*got \[10, 2\]"),
+            (lambda F, K1, K2, a, b: (F, K1.long(), K2, a, b), TypeError, "K1 must be a floating-point .*int64"),
             (lambda F, K1, K2, a, b: (F, 0 * K1, K2, a, b), ValueError, "K1 must be finite and invertible"),
-            (lambda F, K1, K2, a, b: (F, K1, K2.mT, a, b), ValueError, "K2 .* transposed"),
+            (lambda F, K1, K2, a, b: (F, NAN * K1, K2, a, b), ValueError, r"K1 must be finite .* got \[\[nan"),
+            (lambda F, K1, K2, a, b: (F, -K1, K2, a, b), ValueError, "^K1 .*got -0 -0 -1; transposed"),
+            (lambda F, K1, K2, a, b: (F, K1, K2.mT.requires_grad_(), a, b), ValueError, "^K2 .* 1; transposed"),
             (lambda F, K1, K2, a, b: (F, K1, K2, a[:2], b[:2]), ValueError, "one batch, got {'F_mat': 3, 'K1': 3"),
         ]:
             raises(error, message, relative_pose, *change(*pair("orbit", 3, 10)[0]))
