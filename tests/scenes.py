@@ -88,8 +88,8 @@ def uniform(*shape: int, low: float = 0.0, high: float = 1.0, seed: int = 0, dty
     return torch.empty(shape, dtype=dtype).uniform_(low, high, generator=seeded(seed))
 
 
-def small(base=None) -> LearnedNormalizer:
-    return LearnedNormalizer(base or kln.Whitening(), kln.CrossViewNetwork(width=16, depth=2))
+def small(base=None, **options) -> LearnedNormalizer:
+    return LearnedNormalizer(base or kln.Whitening(), kln.CrossViewNetwork(width=16, depth=2, **options))
 
 
 def paper() -> LearnedNormalizer:

@@ -8,7 +8,7 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from pairwise import pairwise
-from scenes import DTYPES, LAYERS, refined, shaken, uniform
+from scenes import DTYPES, LAYERS, refined, shaken, small, uniform
 
 import kornia_learnnorm as kln
 from kornia_learnnorm import EightPoint
@@ -17,7 +17,7 @@ NORMALIZERS = {  # with find_fundamental alone, which has no layer's safeguards
     "hartley": kln.Hartley,
     "whitening": kln.Whitening,
     "reweighted": kln.ReweightedWhitening,
-    "learned": lambda: shaken(kln.LearnedNormalizer(kln.Whitening(), kln.CrossViewNetwork(width=16, depth=2))),
+    "learned": lambda: shaken(small()),
     "learned, reweighted": shaken,
 }
 HOMOGRAPHY = torch.tensor([[1.0, 0.1, 1e-4], [0.0, 1.1, 2e-4], [5.0, 3.0, 1.0]], dtype=torch.float64)

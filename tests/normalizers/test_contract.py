@@ -8,23 +8,18 @@ from hypothesis import strategies as st
 from kornia.geometry.epipolar import normalize_points
 from pairwise import pairwise
 from references import check_refuses
-from scenes import DTYPES, correspondences, paper, shaken, uniform
+from scenes import DTYPES, correspondences, paper, shaken, small, uniform
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.evaluation.searched_normalizer import SearchedNormalizer
 
-
-def crossview(**options):
-    return lambda: shaken(kln.LearnedNormalizer(kln.Whitening(), kln.CrossViewNetwork(width=16, depth=2, **options)))
-
-
 CLOSED_FORM = {"identity": kln.Identity, "hartley": kln.Hartley, "whitening": kln.Whitening}
 CLOSED_FORM |= {"kornia": lambda: kln.PerView(normalize_points), "reweighted": kln.ReweightedWhitening}
 LEARNED = {
-    "own": crossview(features="own"),
-    "both": crossview(features="both"),
-    "epipolar": crossview(),
-    "three parameters": crossview(num_parameters=3),
+    "own": lambda: shaken(small(features="own")),
+    "both": lambda: shaken(small(features="both")),
+    "epipolar": lambda: shaken(small()),
+    "three parameters": lambda: shaken(small(num_parameters=3)),
     "paper": lambda: shaken(paper()),
 }
 DIRECT = CLOSED_FORM | LEARNED

@@ -7,7 +7,7 @@ import pytest
 import torch
 from pairwise import pairwise
 from references import numpy_hartley, numpy_whitening
-from scenes import DTYPES, prepared, raises, shaken, uniform
+from scenes import DTYPES, prepared, raises, shaken, small, uniform
 from torch.autograd import gradcheck
 from torch.nn.functional import layer_norm
 
@@ -141,7 +141,7 @@ whitened = partial(prepared, numpy_whitening)
 
 def crossview(**options) -> CrossViewNetwork:
     """A small network in float64 whose answers are not zero."""
-    return shaken(LearnedNormalizer(network=CrossViewNetwork(width=16, depth=2, **options))).network.double()
+    return shaken(small(**options)).network.double()
 
 
 def set_network(outputs: int = 3) -> SetNetwork:
