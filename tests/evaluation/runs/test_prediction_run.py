@@ -203,7 +203,7 @@ def test_names_become_different_files():
     assert [file_name(name) for name in plain] == plain
 
 
-def test_predictions_of_the_true_matrix():
+def test_predictions_of_the_true_matrix_and_of_each_constraint():
     store = synthetic_store(pairs=4, points=64, seed=3, noise=0.5, outliers=0.0, scenes=["orbit"])
     points1, points2 = (torch.from_numpy(p).reshape(4, 64, 2) for p in (store.points1, store.points2))
     samples = MatchSets(points1, points2, points1[:, :1], points2[:, :1], torch.arange(4))
@@ -215,16 +215,9 @@ def test_predictions_of_the_true_matrix():
     assert found["rotation_error"].max() < 1e-6
     assert found["translation_error"].max() < 1e-4
     assert found["distance1"] == pytest.approx(2**0.5)
-
-
-@pytest.mark.parametrize("rank2", ["projection", "optimal"])
-def test_predictions_are_those_of_the_constraint(rank2):
-    store = synthetic_store(pairs=4, points=16, seed=3, noise=0.5, outliers=0.0, scenes=["orbit"])
-    points1, points2 = (torch.from_numpy(p).reshape(4, 16, 2) for p in (store.points1, store.points2))
-    samples = MatchSets(points1, points2, points1[:, :1], points2[:, :1], torch.arange(4))
-    method = find_method("Hartley+optimal" if rank2 == "optimal" else "Hartley")
-    expected = kln.find_fundamental(points1.double(), points2.double(), rank2=rank2).numpy()
-    np.testing.assert_allclose(predict(method, samples, store, None)["F_mat"], expected, atol=1e-9)
+    for name, rank2 in (("Hartley", "projection"), ("Hartley+optimal", "optimal")):
+        expected = kln.find_fundamental(points1.double(), points2.double(), rank2=rank2).numpy()
+        np.testing.assert_allclose(predict(find_method(name), samples, store, None)["F_mat"], expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("max_ratio", [0.8, None])
