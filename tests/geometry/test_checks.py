@@ -1,21 +1,10 @@
-"""The checks, the dtype and the averages that all modules share."""
+"""The checks of shapes and the dtype that all modules share."""
 
 import torch
 from kornia.core.exceptions import ShapeError
 from scenes import raises
 
-from kornia_learnnorm.geometry.checks import check_cameras, check_tensor, solve_dtype
-
-K = torch.tensor([[700.0, 0.0, 320.0], [0.0, 700.0, 240.0], [0.0, 0.0, 1.0]])
-
-
-def focal_length(camera):
-    check_cameras(camera, camera)
-    return camera[0, 0]
-
-
-def test_values_of_cameras_are_not_read_in_vmap():
-    assert torch.func.vmap(focal_length)(torch.stack([K, K.T])).tolist() == [700.0, 700.0]
+from kornia_learnnorm.geometry.checks import check_tensor, solve_dtype
 
 
 def test_a_wrong_shape_names_what_to_write():
