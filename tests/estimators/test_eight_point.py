@@ -196,7 +196,7 @@ class TestGradients:
         layer, weights = LAYERS[name]().double(), [uniform(1, 9, low=0.2)] if number == 9 else []
         gradient = derivative(lambda *values: signless(layer(*values)))
         values = *correspondences("handheld", 1, number), *weights
-        check_gradients(gradient, *values, eps=1e-4, atol=1e-3, rtol=1e-2)
+        check_gradients(gradient, *values, eps=1e-4, atol=1e-5, rtol=1e-2)
         for modes in ((jacfwd, jacrev), (hessian, lambda f: jacrev(jacrev(f)))):
             found = [mode(lambda x: layer(x, values[1])[..., 0, :].square().sum())(values[0]) for mode in modes]
             torch.testing.assert_close(*found, rtol=1e-5, atol=1e-8)
