@@ -179,18 +179,10 @@ class TestErrors:
         (images / NAMES[2]).unlink()
         raises(FileNotFoundError, r"1 of 4 images are not in .*, the first is views/2\.png", export, images)
 
-    @pytest.mark.parametrize(
-        ("broken", "message"),
-        [
-            (b"", r"leaves out 1 of 4 images, the first is views/1\.png"),
-            (None, r"1\.png was matched at 640 x 480 .* reads 320 x 240"),
-        ],
-    )
-    def test_images_that_colmap_does_not_take(self, images, broken, message):
-        if broken is None:
-            Image.new("L", (320, 240)).save(images / NAMES[1])
-            raises(ValueError, "leaves out 1 of 4 images", check_images, images, NAMES, single_camera=True)
-        else:
-            (images / NAMES[1]).write_bytes(broken)
-        raises(ValueError, message, export, images, turned=broken is None)
+    def test_images_that_colmap_does_not_take(self, images):
+        (images / NAMES[1]).write_bytes(b"")
+        raises(ValueError, r"leaves out 1 of 4 images, the first is views/1\.png", export, images, turned=False)
+        Image.new("L", (320, 240)).save(images / NAMES[1])
+        raises(ValueError, "leaves out 1 of 4 images", check_images, images, NAMES, single_camera=True)
+        raises(ValueError, r"1\.png was matched at 640 x 480 .* reads 320 x 240", export, images, turned=True)
         assert not [*images.glob("*.db*"), *images.glob(".*")]  # nothing is left
