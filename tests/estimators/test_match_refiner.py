@@ -25,19 +25,14 @@ SHIFT = 0.4, -0.3  # of the second image against the first, pixels
 trained = partial(roughened, kln.MatchRefiner)
 
 
-def images(number: int = 1, channels: int = 1) -> tuple[Tensor, Tensor]:
-    """A texture and the same one moved by SHIFT, of another size."""
+def inputs(number: int = 1, num_points: int = 20, channels: int = 1) -> list[Tensor]:
+    """A texture, the same one moved by SHIFT, of another size, and matches, which lie at the same place of both."""
     image = cv2.GaussianBlur(texture(0, WIDTH, HEIGHT), (0, 0), 1.5)
     shift = np.array([[1.0, 0, SHIFT[0]], [0, 1, SHIFT[1]]])
     pair = image, cv2.warpAffine(image, shift, (WIDTH, HEIGHT), flags=cv2.INTER_CUBIC)[:, :-10]
-    first, second = (torch.from_numpy(view / 255.0).expand(number, channels, -1, -1) for view in pair)
-    return first, second
-
-
-def inputs(number: int = 1, num_points: int = 20, channels: int = 1) -> list[Tensor]:
-    """Images and matches in them, which lie at the same place of both."""
+    images = (torch.from_numpy(view / 255.0).expand(number, channels, -1, -1) for view in pair)
     points = 15 + torch.tensor([WIDTH - 40.0, HEIGHT - 30.0]).double() * uniform(number, num_points, 2, seed=3)
-    return [*images(number, channels), points, points.clone()]
+    return [*images, points, points.clone()]
 
 
 @pairwise(number=[0, 1, 3], num_points=[0, 1, 20], channels=[1, 3], dtype=DTYPES, masked=[False, True])
