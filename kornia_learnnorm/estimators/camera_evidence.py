@@ -1,4 +1,4 @@
-"""Whether correspondences contradict the cameras that a pose was estimated with."""
+"""Test whether correspondences contradict the cameras that a pose was estimated with."""
 
 import torch
 from torch import Tensor
@@ -10,16 +10,16 @@ from kornia_learnnorm.geometry.dlt import normal_equations, row_products
 from kornia_learnnorm.models.essential import Calibrated, Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 
-SIGNIFICANCE = 1e-3  # probability that noise alone speaks against cameras as much
+SIGNIFICANCE = 1e-3  # largest probability that noise alone contradicts the cameras as much
 MIN_EFFECT = 0.05  # share of the noise that two more parameters must explain: errors of matches are not independent
 MIN_NOISE = 0.01  # of the loss's scale: where inliers have no noise, the pull of outliers is no evidence
-MIN_KEPT = 0.3  # share of the fit with cameras that the pose of one without must keep
+MIN_KEPT = 0.3  # share of the fit with cameras that the pose of a matrix without them must keep
 MIN_PRECISION = 1 / 9  # of a pose without cameras over that with them: at most three times the standard error
 
 
 @torch.no_grad()
 def contradict_cameras(evidence: Evidence, state: Calibrated, weights: Tensor, square_scale: Tensor) -> Tensor:
-    r"""Return for which sets a pose without cameras is to be trusted more, (B,) bool.
+    r"""Return for which sets a pose estimated without cameras is more reliable, (B,) bool.
 
     The states are optima of weights (B, N) and of Geman and McClure's loss of a squared scale (B, 1). By a score test,
     the gain of a Gauss-Newton step of seven parameters over one of five, divided by the mean of :math:`\psi^2` and
@@ -39,7 +39,7 @@ def contradict_cameras(evidence: Evidence, state: Calibrated, weights: Tensor, s
     cost = (inner * squares).sum(1)
     free = torch.linalg.matrix_norm(F_mat, keepdim=True) * Fundamental().state(F_mat).tangents()
     tangents = state.tangents()
-    pose = torch.linalg.solve_ex(tangents.mT @ tangents, tangents.mT @ free)[0]  # step with cameras of one without
+    pose = torch.linalg.solve_ex(tangents.mT @ tangents, tangents.mT @ free)[0]  # nearest steps with cameras
     e = F_mat.mT.reshape(-1, 9, 1)
     scale = cost / safe_divisor((e.mT @ M @ e)[:, 0, 0])
     gains, variances = [], []
@@ -63,7 +63,7 @@ def keeps_fit(
     """Return for which sets the other states fit at least 0.3 times as well as the states, (B,) bool.
 
     Where a plane leaves a fundamental matrix nearly undetermined, its pose may fit hardly any correspondence, while
-    inexact cameras cost a few pixels: the squared scale (B, 1) is to allow for these.
+    inexact cameras cost a few pixels, which the squared scale (B, 1) must allow for.
     """
     losses = evidence.losses(torch.stack([state.matrix(), other.matrix()], 1), square_scale[:, None])
     fit = ((1 - losses) @ weights[..., None])[..., 0]

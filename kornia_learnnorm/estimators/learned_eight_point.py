@@ -1,4 +1,4 @@
-r"""The learned eight-point algorithm: a network weighs the correspondences and chooses the transforms, in stages."""
+r"""The learned eight-point algorithm: in each stage, a network weights the correspondences and predicts transforms."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -16,15 +16,15 @@ from kornia_learnnorm.geometry.checks import check_cameras, is_known_true
 from kornia_learnnorm.geometry.seven_point import fundamental_in_span
 from kornia_learnnorm.models.fundamental import Fundamental, Rank2, Rank2Method
 
-COMPARED_SCALE, FIT_SCALE = 2.2, 3.0  # of comparisons and of fits on moments, in geometric means of the distances
-LAST_FLOOR = 0.002  # of the frame's unit, about half a pixel, added to the last scale
-LAST_POWER = 0.2  # of the probabilities in the last fit: most matches are to count, and a robust loss drops outliers
-FIRST_STEPS, LOCAL_STEPS = 1, 3  # reweightings of the network's matrix before the search, and of candidates
-SEARCH_STEPS = 6  # of the last stage's steps that a search takes the place of
-RELAXATION = 1.3  # of a step: the curvature of a robust loss is less than its weights
-MAX_SCORED = 128  # matches by which the matrices of samples are compared first
-SHORTLIST = 6  # matrices of samples that are compared on all matches
-# Matches, and the sum of their probabilities, from which samples are drawn: among few, some fit most of them by chance.
+COMPARED_SCALE, FIT_SCALE = 2.2, 3.0  # scales of the loss to compare and to fit, in geometric means of the distances
+LAST_FLOOR = 0.002  # frame units, about half a pixel; its square is added to the squared scale of the last fit
+LAST_POWER = 0.2  # exponent of the probabilities in the last fit: nearly equal weights, as the loss rejects outliers
+FIRST_STEPS, LOCAL_STEPS = 1, 3  # reweighting steps from the network's matrix before the search, and from candidates
+SEARCH_STEPS = 6  # refinement steps of the last stage that the search replaces
+RELAXATION = 1.3  # factor on a step: a robust loss has less curvature than its weights imply
+MAX_SCORED = 128  # matches on which the matrices of samples are pre-scored
+SHORTLIST = 6  # best matrices of samples, which are then compared on all matches
+# Smallest number of matches, and sum of their probabilities, for a search: some sample fits most of fewer by chance.
 MIN_MATCHES, MIN_INLIERS = 16, 8
 
 
@@ -34,21 +34,21 @@ class LearnedEstimate(NamedTuple):
     F_mat: Tensor  # of rank 2 and unit Frobenius norm, x2^T F x1 = 0, (B, 3, 3)
     E_mat: Tensor | None  # K2^T F K1 with unit Frobenius norm, (B, 3, 3), or None without cameras
     determined: Tensor  # whether the correspondences determine a matrix, (B,) bool; see TwoViewEstimate
-    gap: Tensor  # relative gap of the design matrix that `determined` is decided on, (B,)
+    gap: Tensor  # relative gap of the design matrix, which decides `determined`, (B,)
     # Inlier probability of each correspondence, (B, N); zero for absent ones, one half in sets that are not determined.
     weights: Tensor
     stages: tuple[StageEstimate, ...]  # result of each stage before its refinement, in order
 
 
 class FundamentalRefinement(Refinement):
-    """Robust refinement of a stage's matrices, and in the last stage the search of :class:`LearnedEightPoint`."""
+    """Refine a stage's matrices robustly; in the last stage, run the search of :class:`LearnedEightPoint`."""
 
     min_searched = MIN_MATCHES
 
     def optimize(self, M: Tensor, probability: Tensor, steps: int, last: bool) -> Tensor:
-        """Return the matrices after so many steps; in the last stage, searched sets take some from their best one.
+        """Return the matrices after ``steps`` steps; in the last stage, the search replaces six of them.
 
-        The choice among matrices has no derivative; through a zero, the transforms still get a gradient of zero.
+        The choice among candidates has no derivative; adding zero times M gives the transforms a gradient of zero.
         """
         if not (last and steps and self.samples):
             return super().optimize(M, probability, steps, last)
@@ -61,7 +61,7 @@ class FundamentalRefinement(Refinement):
         state = Rank2(best.axes + 0.0 * M[:, None], best.A)
         power = probability.clamp(min=torch.finfo(M.dtype).tiny) ** LAST_POWER
         power = power if self.weights is None else power * self.weights
-        # The scale moves along, so that derivatives don't depend on where the fit began.
+        # The scale is computed anew in each step, so that derivatives do not depend on where the fit began.
         options = (lambda s: FIT_SCALE**2 * mean(s) + LAST_FLOOR**2), max(1, steps - SEARCH_STEPS), RELAXATION
         fitted: Tensor = descend(evidence, state, power[:, None], *options).matrix()
         present = weights > 0
@@ -73,12 +73,12 @@ class FundamentalRefinement(Refinement):
     def _most_consistent(
         self, evidence: Evidence, M: Tensor, weights: Tensor, mean: Callable[[Tensor], Tensor]
     ) -> Rank2:
-        """Return the states of least cost of all matches among matrices (B, S, 3, 3) and those of samples.
+        """Return the states with the least cost over all matches, among matrices (B, S, 3, 3) and those of samples.
 
-        The scale of the cost is that of the matrix with the least mean distance: weights may be poor.
+        The scale of the cost is the least mean distance of any candidate, since the weights may be poor.
         """
         present = (weights > 0).to(weights)
-        # Matches in the order of their weights: samples and choices don't depend on the order that they came in.
+        # Sort the matches by weight, so that samples and choices do not depend on the order of the input.
         order = weights.argsort(dim=1, descending=True, stable=True)
         drawn, real = self._draw(evidence, weights, order)
         some = evenly_ranked(order, present, MAX_SCORED)
@@ -98,7 +98,7 @@ class FundamentalRefinement(Refinement):
     def _draw(self, evidence: Evidence, weights: Tensor, order: Tensor) -> tuple[Tensor, Tensor]:
         """Return the matrices of samples, (B, S, 3, 3), and which of them are real.
 
-        Those of large samples, a third, and those of minimal ones unless a set has few outliers.
+        There are a third as many large samples as minimal ones; sets with few outliers use the large ones alone.
         """
         large = self.model.constrain(fit_samples(evidence, weights, order, -(-self.samples // 3)))
         real = torch.ones_like(large[..., 0, 0], dtype=torch.bool)
@@ -125,39 +125,39 @@ class LearnedEightPoint(LearnedLayer):
     (in the first stage :math:`\sigma(l_i)`) and transforms :math:`T = B(p)\, T_{Hartley}`, where :math:`B` builds a
     symmetric positive definite transform and :math:`T_{Hartley}` normalises the weighted points. Each stage ends with a
     few robust Levenberg-Marquardt steps on the Sampson distances, weighted by :math:`\sigma(l_i)`
-    (:func:`~kornia_learnnorm.estimators.optimize.refine_unrolled`), or with the search.
+    (:func:`~kornia_learnnorm.estimators.optimize.refine_unrolled`) or, in the last stage, with a search.
 
-    The search in the last stage is for sets of 16 or more correspondences with :math:`\sum_i \sigma(l_i) \ge 8`. It
-    draws samples by :math:`\sigma(l_i)`: minimal samples of seven, and a third as many samples of 20, which average the
-    noise. Of their matrices and the network's, the one of least robust cost over all correspondences is fitted to all
-    of them, weighted by :math:`\sigma(l_i)^{0.2}`. In evaluation mode, sets of 16 or more with a mean
+    The search runs on sets of 16 or more correspondences with :math:`\sum_i \sigma(l_i) \ge 8`. It draws samples by
+    :math:`\sigma(l_i)`: minimal samples of seven, and a third as many samples of 20, which average the noise. Among
+    their matrices and the network's, the one with the least robust cost over all correspondences is fitted to all of
+    them, with weights :math:`\sigma(l_i)^{0.2}`. In evaluation mode, sets of 16 or more with a mean
     :math:`\sigma(l_i)` above 0.7 in the first stage skip the other stages and the minimal samples.
 
-    Eight correspondences determine their null vector whatever the weights. The result is then its weighted optimal
-    correction, :func:`~kornia_learnnorm.optimal_rank2`. If the correction leaves the eight more than 1 % of their mean
-    distance from the centroid away, some are outliers, and the result is Hartley's projection. The networks get a
-    gradient of zero.
+    With eight correspondences the null vector does not depend on the weights. The result is then its weighted optimal
+    correction, :func:`~kornia_learnnorm.optimal_rank2`. If its root mean square distance to the eight exceeds 1 % of
+    their mean distance from the centroid, some are outliers, and the result is the rank-2 projection in Hartley's
+    coordinates. The networks get a gradient of zero.
 
     The order of the correspondences has no effect. Swapping the views gives :math:`F^\top` up to sign. :math:`F` is
     equivariant to a translation and a scale that are common to both images; to rotations and different scales only
     approximately, by training. Where the least-squares rotation from one view's points to the other's is larger than 45
-    degrees, the networks read the points of one view rotated back. Among few correspondences with many outliers, such
-    as 64 with 80 %, the rotation often cannot be told from chance; rotate the image first if you know that it is.
+    degrees, the networks read the points of one view rotated back. With few correspondences and many outliers, such as
+    64 with 80 % outliers, this rotation often cannot be told from chance: if you know it, rotate the image first.
 
     Args:
         width: channels of the networks.
         depth: blocks of each stage's network.
         stages: number of stages.
-        learn_transforms: predict transforms; otherwise they are Hartley's of the weighted points, and the heads of the
+        learn_transforms: predict transforms; otherwise they are Hartley's for the weighted points, and the heads of the
             networks get no gradient (set ``find_unused_parameters=True`` in DistributedDataParallel).
         rank2: how the singularity constraint is enforced, see :func:`kornia_learnnorm.find_fundamental`.
-        refine_steps: refinement steps in the last stage, and at most three in the others; 0 turns refinement off.
-            Gradients are the derivatives of these steps: 40 steps bring them closer to those of the optimum.
+        refine_steps: refinement steps in the last stage (after a search six fewer, at least one), at most three in the
+            others; 0 turns both off. Gradients are those of the steps: 40 bring them closer to those of the optimum.
         samples: minimal samples of the search; 0 turns the search off.
 
     Attributes:
-        detach_stages: for training the layer itself with a loss of every stage: no gradient passes from a stage to the
-            one before, and the last stage is not refined.
+        detach_stages: for training with a loss on every stage: no gradient passes to the previous stage, and the last
+            stage is not refined.
         trained_on: names of the data that the weights were trained on, saved with them; empty if unknown.
 
     Raises:
@@ -195,8 +195,8 @@ class LearnedEightPoint(LearnedLayer):
     def from_pretrained(cls, name: str | Path = "robust-synthetic") -> "LearnedEightPoint":
         """Load a trained estimator for evaluation: ``"robust-synthetic"``, ``"robust"``, ``"robust-tiny"``, or a file.
 
-        FileNotFoundError if there are no such weights, with a list of those that ship; ValueError if the file is not
-        an estimator of this package or its tensors do not fit.
+        FileNotFoundError, which lists the shipped weights, if there are none of this name; ValueError if the file is
+        not an estimator of this package or its tensors do not fit.
         """
         return super().from_pretrained(name)  # configurations need the name of the class, not Self
 
@@ -217,7 +217,7 @@ class LearnedEightPoint(LearnedLayer):
     ) -> LearnedEstimate:
         r"""Return the fundamental matrices, the inlier probabilities and the result of each stage.
 
-        Shapes and errors are those of :meth:`~kornia_learnnorm.EightPoint.estimate`, and those of the scores below.
+        Shapes and errors are those of :meth:`~kornia_learnnorm.EightPoint.estimate`, and the errors of scores below.
 
         Args:
             points1: pixels in the first view with shape :math:`(B, N, 2)`, :math:`N \ge 8`.

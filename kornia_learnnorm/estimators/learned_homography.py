@@ -1,4 +1,4 @@
-r"""The learned homography: from matches of a plane, or of a camera that only rotates."""
+r"""The learned homography of a plane, or of a camera that only rotates, from matches with outliers."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -18,15 +18,15 @@ from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.homography import Homography, solve_four_points, squared_distances
 
-# Of the robust loss, in geometric means of the inliers' distances: of early stages, comparisons and the last fit.
+# Scales of the robust loss in early stages, in comparisons and in the last fit: geometric means of inlier distances.
 EARLY_SCALE, COMPARED_SCALE, LAST_SCALE = 3.0, 1.5, 6.0
-NEAR = 3.0  # geometric means, up to about which distances count in the mean itself in evaluation
-LAST_POWER = 0.05  # of the probabilities in the last fit: most matches are to count, and a robust loss drops outliers
-LOCAL_STEPS = 2  # reweightings of candidates
-MAX_SCORED = 128  # matches by which candidates are compared
+NEAR = 3.0  # geometric means; in evaluation, distances beyond about this hardly count in the mean itself
+LAST_POWER = 0.05  # exponent of the probabilities in the last fit: nearly equal weights, as the loss rejects outliers
+LOCAL_STEPS = 2  # reweighting steps from a candidate
+MAX_SCORED = 128  # matches on which candidates are pre-scored
 SHORTLIST = 2  # matrices of minimal samples that are refined
-MIN_MARGIN = 1e-3  # of the frame's unit, by which a minimal sample has to miss being degenerate
-MIN_MATCHES = 8  # from which samples are drawn: among few, some fit most of them by chance
+MIN_MARGIN = 1e-3  # frame units; smallest shift of a point that makes three points of a minimal sample collinear
+MIN_MATCHES = 8  # smallest set for which samples are drawn: some sample fits most of fewer matches by chance
 
 
 class HomographyStage(NamedTuple):
@@ -41,21 +41,21 @@ class HomographyEstimate(NamedTuple):
 
     H_mat: Tensor  # of unit Frobenius norm, map homogeneous pixels of image 1 to image 2, (B, 3, 3)
     determined: Tensor  # whether the correspondences determine an invertible matrix, (B,) bool
-    gap: Tensor  # relative gap of the design matrix that `determined` is decided on, (B,)
+    gap: Tensor  # relative gap of the design matrix, which decides `determined`, (B,)
     # Inlier probability of each correspondence, (B, N); zero for absent ones, one half in sets that are not determined.
     weights: Tensor
     stages: tuple[HomographyStage, ...]  # result of each stage before its refinement, in order
 
 
 class HomographyRefinement(Refinement):
-    r"""Reweighted least squares of a stage's matrices, and in the last the search of :class:`LearnedHomography`.
+    r"""Refine matrices by reweighted least squares; in the last stage, run the search of :class:`LearnedHomography`.
 
-    Correspondences enter a step through the :math:`9 \times 9` matrix of the second moments of their design rows alone,
-    which weighted moments of view 1's points make: a step costs little for ten matches and for thousands.
+    A step needs only the :math:`9 \times 9` matrix of the second moments of the design rows, computed from weighted
+    moments of view 1's points: it is cheap even for thousands of matches.
 
-    Matches are weighted by the probabilities of inliers and the derivative of Geman and McClure's loss of squared
-    distances :math:`r` over a squared scale, :math:`(1 + r)^{-2}`. In the last stage these are probabilities to the
-    power of 0.05 and :math:`(1 + r^2)^{-2}`, which leaves inliers nearly equal weights.
+    A match is weighted by its inlier probability times :math:`(1 + r)^{-2}`, the derivative of Geman and McClure's
+    loss, with :math:`r` its squared distance over the squared scale. In the last stage it is the probability to the
+    power of 0.05 times :math:`(1 + r^2)^{-2}`, which gives inliers nearly equal weights.
     """
 
     model: Homography
@@ -69,9 +69,9 @@ class HomographyRefinement(Refinement):
         self.evidence = model.sampson_terms(self.x1, self.x2), products
 
     def optimize(self, M: Tensor, probability: Tensor, steps: int, last: bool) -> Tensor:
-        """Return the matrices after so many steps.
+        """Return the matrices after ``steps`` steps.
 
-        The choice among matrices has no derivative; through a zero, the transforms still get a gradient of zero.
+        The choice among candidates has no derivative; adding zero times M gives the transforms a gradient of zero.
         """
         inliers = probability if self.weights is None else probability * self.weights
         near = NEAR if self.settle else None
@@ -96,8 +96,8 @@ class HomographyRefinement(Refinement):
         return self._descend(M, self.evidence, weigh, steps)[:, 0]
 
     def _most_consistent(self, own: Tensor, inliers: Tensor, square_scale: Tensor) -> Tensor:
-        """Return the matrices of least cost, (B, 1, 3, 3), among own ones and those of minimal samples."""
-        # Matches in the order of their weights: samples and choices don't depend on the order that they came in.
+        """Return the matrices with the least cost, (B, 1, 3, 3), among ``own`` and those of minimal samples."""
+        # Sort the matches by weight, so that samples and choices do not depend on the order of the input.
         order = inliers.argsort(dim=1, descending=True, stable=True)
         drawn = draw_matches(inliers, order, self.samples, self.model.sample_size)[:, None].expand(-1, 3, -1)
         views = (torch.unflatten(x.gather(2, drawn), 2, (self.samples, -1)) for x in (self.x1, self.x2))
@@ -132,21 +132,21 @@ class HomographyRefinement(Refinement):
 class LearnedHomography(LearnedLayer):
     r"""Estimate the homography of a plane, or of a camera that only rotates, from matches with outliers in one pass.
 
-    It is :class:`~kornia_learnnorm.LearnedEightPoint` for homographies, differentiable too. The network of each stage
-    predicts an inlier probability for every correspondence and two transforms, the weighted DLT follows in their
-    coordinates, and reweighted least squares on the Sampson distances refines its matrix. In the last stage of sets of
-    eight or more correspondences, minimal samples of four are drawn by the probabilities. Of their matrices and the
-    network's, the one of least robust cost over all correspondences is fitted to all of them. The probabilities have
-    little weight in this fit: where noise is coarse, full weights suppress correct matches that the matrix needs. In
-    evaluation mode, sets of 16 or more correspondences with a mean probability above 0.7 in the first stage skip the
-    other stages.
+    It is :class:`~kornia_learnnorm.LearnedEightPoint` for homographies, and is differentiable too. In each stage, a
+    network predicts an inlier probability for every correspondence and two transforms, the weighted DLT is solved in
+    the transformed coordinates, and reweighted least squares on the Sampson distances refine its matrix. In the last
+    stage, sets of eight or more correspondences are searched: minimal samples of four are drawn by the probabilities.
+    Among their matrices and the network's, the one with the least robust cost over all correspondences is fitted to all
+    of them. This fit hardly uses the probabilities: with coarse noise, full weights would suppress correct matches that
+    the matrix needs. In evaluation mode, sets of 16 or more correspondences with a mean probability above 0.7 in the
+    first stage skip the other stages.
 
-    Four correspondences determine their matrix exactly, whatever the weights; the networks get a gradient of zero. The
-    order of the correspondences has no effect. Swapping the views gives :math:`H^{-1}` up to scale. :math:`H` is
+    Four correspondences determine the matrix exactly: weights have no effect, and the networks get a gradient of zero.
+    The order of the correspondences has no effect. Swapping the views gives :math:`H^{-1}` up to scale. :math:`H` is
     equivariant to a translation and a scale that are common to both images.
 
-    Do not use it on scenes with relief: it returns the homography that most matches agree on, without a warning. What
-    :class:`~kornia_learnnorm.LearnedEightPoint` says of rotated images holds here too.
+    Do not use it on scenes with relief: it returns the homography that most matches agree on, without a warning. For
+    rotated images, see :class:`~kornia_learnnorm.LearnedEightPoint`.
 
     Args:
         width: channels of the networks.
@@ -154,7 +154,7 @@ class LearnedHomography(LearnedLayer):
         stages: number of stages.
         refine_steps: reweightings in the last stage, and at most three in the others. Gradients are the derivatives of
             these steps: many steps make them huge where few matches are inliers.
-        samples: minimal samples in the last stage; with 0, the last fit begins at the network's matrix.
+        samples: minimal samples in the last stage; with 0, the last fit starts from the network's matrix.
 
     Attributes and errors are those of :class:`~kornia_learnnorm.LearnedEightPoint`.
 
@@ -218,7 +218,7 @@ class LearnedHomography(LearnedLayer):
         return HomographyEstimate(found[-1].F_mat, problem.determined, problem.gap, probability, stages)
 
     def _run(self, problem: LinearProblem, scores: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Run the stages from the view whose points spread less to the other: errors are not the same both ways."""
+        """Run the stages with the view whose points spread less as the first: distances under H are not symmetric."""
         swapped = CommonFrame.from_points(problem.points1, problem.points2, problem.present).swapped[:, None, None]
         points1, points2 = problem.points1, problem.points2
         points1, points2 = torch.where(swapped, points2, points1), torch.where(swapped, points1, points2)

@@ -21,10 +21,10 @@ from kornia_learnnorm.models.two_view_model import TwoViewModel
 from kornia_learnnorm.pretrained import check_architecture, load_module, save_module
 
 FORMAT = "kornia_learnnorm.eight_point.v1"
-# A normal variable's variance over the geometric mean of its squared length, by its number of components.
+# Variance of a normal vector's components over the geometric mean of its squared length, by number of components.
 VARIANCE = {1: 3.562, 2: 0.8905}
-LOG_RANGE = math.log(4 / math.sqrt(2 * math.pi))  # outliers are four of the frame's units wide
-MIN_JUDGED = 16  # matches of a set whose distances tell inliers: a matrix fits fewer by chance
+LOG_RANGE = math.log(4 / math.sqrt(2 * math.pi))  # outliers are uniform over a width of four frame units
+MIN_JUDGED = 16  # smallest set whose distances count in inlier probabilities: a matrix fits fewer by chance
 
 
 class StageEstimate(NamedTuple):
@@ -37,15 +37,15 @@ class StageEstimate(NamedTuple):
 class LearnedLayer(MatchLayer):
     """Base class of the learned layers: networks predict weights and transforms of a model's DLT, in stages.
 
-    Arguments, attributes and errors are those of :class:`LearnedEightPoint`; ``model`` says what the matrix is.
+    Arguments, attributes and errors are those of :class:`LearnedEightPoint`; ``model`` defines the matrix.
     """
 
     scores_are = "scores"
     model_name: str  # of the model whose files this class loads
-    # Numbers that a stage's network reads of a correspondence, reads from the second on, and gives for the whole set.
+    # Features of a correspondence, additional ones from the second stage on, and a network's outputs for the whole set.
     features, residual_features, outputs = POINT_FEATURES, RESIDUAL_FEATURES, 2 * TRANSFORM_PARAMS
     architecture: tuple[str, ...]  # arguments that files hold
-    added: ClassVar[dict[str, Any]] = {}  # those that files of earlier versions lack
+    added: ClassVar[dict[str, Any]] = {}  # values of arguments that files of earlier versions lack
     refinement: type[Refinement] = Refinement
     learn_transforms = True
 
@@ -93,7 +93,7 @@ class LearnedLayer(MatchLayer):
 
         def build(held: dict[str, Any]) -> Self:  # type: ignore[type-var]
             architecture = cls.added | held
-            model = architecture.pop("model", Fundamental.name)  # files before the name was written
+            model = architecture.pop("model", Fundamental.name)  # files of earlier versions have no name
             if model != cls.model_name:
                 raise ValueError(f"it is of the model {model!r}, expected {cls.model_name!r} for a {cls.__name__}")
             if set(architecture) != set(cls.architecture):
@@ -116,7 +116,7 @@ class LearnedLayer(MatchLayer):
     def _estimate(
         self, points1: Tensor, points2: Tensor, weights: Tensor | None, mask: Tensor | None, scores: Tensor | None
     ) -> tuple[LinearProblem, tuple[StageEstimate, ...]]:
-        """Return the problem, what each stage gives and the final estimate."""
+        """Return the problem and the estimates of all stages, the final one last."""
         problem = prepare_problem(self.model, points1, points2, weights, mask)
         scores = None if scores is None else check_scores(scores, points1, mask).to(problem.x1)
 
@@ -140,7 +140,7 @@ class LearnedLayer(MatchLayer):
 def inlier_probability(
     model: TwoViewModel, problem: LinearProblem, M: Tensor, logits: Tensor, determined: Tensor
 ) -> Tensor:
-    """Return the probabilities (B, N) of inliers of matrices (B, 3, 3) in pixels, with logits (B, N) before them.
+    """Return the posterior inlier probabilities (B, N) under matrices (B, 3, 3) in pixels, from prior logits (B, N).
 
     By Bayes' rule: distances of inliers are normally distributed, those of outliers uniformly over the image. The
     logits alone decide in sets of fewer than 16 correspondences, which a matrix may fit by chance, and in undetermined
@@ -150,7 +150,7 @@ def inlier_probability(
     frame = CommonFrame.from_points(problem.points1, problem.points2, problem.present)
     x1, x2 = convert_points_to_homogeneous(torch.stack([frame.x1, frame.x2])).mT
     M, prior = model.carry(M.to(x1), frame.inverse, frame.inverse), logits.to(x1)
-    swapped = frame.swapped[:, None, None]  # distances of a homography are not the same both ways
+    swapped = frame.swapped[:, None, None]  # distances under a homography are not symmetric
     M = torch.where(swapped, model.swap(M), M)
     x1, x2 = torch.where(swapped, x2, x1), torch.where(swapped, x1, x2)
     squares = model.squares(model.residual(M / torch.linalg.matrix_norm(M, keepdim=True), x1, x2))

@@ -34,8 +34,8 @@ class RelativePoseEstimate(NamedTuple):
     F_mat: Tensor  # K2^-T E K1^-1 with unit Frobenius norm, (B, 3, 3)
     R: Tensor  # rotations of X2 = R X1 + t, (B, 3, 3)
     t: Tensor  # translations of unit length, (B, 3)
-    determined: Tensor  # whether the correspondences allow for finitely many matrices, (B,) bool
-    gap: Tensor  # relative gap of the design matrix that `determined` is decided on, (B,)
+    determined: Tensor  # whether only finitely many matrices fit the correspondences, (B,) bool
+    gap: Tensor  # relative gap of the design matrix, which decides `determined`, (B,)
     # Inlier probability of each correspondence, (B, N); zero for absent ones, one half in sets that are not determined.
     weights: Tensor
     stages: tuple[PoseStage, ...]  # the last one holds the result
@@ -45,24 +45,24 @@ class LearnedRelativePose(LearnedLayer):
     r"""Estimate the relative pose of calibrated cameras from matches with outliers in one differentiable pass.
 
     It is :class:`~kornia_learnnorm.LearnedEightPoint` for calibrated cameras. Its networks also read the viewing rays
-    of both points, the size of the set in pixels and, from the second stage on, the distances in pixels. In each stage
-    the weighted rows of the design matrix give a :math:`9 \times 9` matrix of moments. The candidates are the essential
-    matrices in the span of its four smallest eigenvectors
-    (:func:`~kornia_learnnorm.geometry.five_point.essential_in_span`), the one nearest to the smallest eigenvector, that
-    of the stage before and, in the last stage, those of minimal samples drawn by the weights. The candidate of least
+    of both points, the scale of the set in pixels and, from the second stage on, the distances in pixels. Each stage
+    computes the :math:`9 \times 9` matrix of second moments of the weighted design rows. The candidates are the
+    essential matrices in the span of its eigenvectors with the four smallest eigenvalues
+    (:func:`~kornia_learnnorm.geometry.five_point.essential_in_span`), the one nearest to the smallest of these, that of
+    the previous stage and, in the last stage, those of minimal samples drawn by the weights. If fewer than 40 % of the
+    correspondences agree with the best of these, as many samples are drawn again near it. The candidate with the least
     robust cost is refined by reweighted least squares on the Sampson distances over the five parameters of a relative
-    pose; the refinement carries the gradients. Where fewer than four tenths of the correspondences agree with it, as
-    many samples are drawn again near it. In evaluation mode, sets of 16 or more correspondences with a mean probability
-    above 0.7 in the first stage skip the matrix of that stage, the other networks and half of the samples.
+    pose; gradients pass through this refinement alone. In evaluation mode, sets of 16 or more correspondences with a
+    mean probability above 0.7 in the first stage skip its matrix, the other networks and half of the samples.
 
     If a score test finds that the correspondences contradict the cameras (inexact intrinsics or lens distortion), the
     pose is that of a refined fundamental matrix, provided that its standard error is at most three times as large and
     it fits to a few pixels.
 
     The order of the correspondences has no effect. Swapping the views, with their cameras, gives :math:`E^\top` up to
-    sign. Up to ten matrices fit five correspondences exactly; rounding may then choose one. Planes and forward motion
-    need no special treatment. A camera that only rotates has no translation: the returned direction is arbitrary.
-    Undistort the points first if the distortion is known.
+    sign. Up to ten matrices fit five correspondences exactly; rounding may decide between them. Planes and forward
+    motion need no special treatment. A camera that only rotates has no translation: the returned direction is
+    arbitrary. Undistort the points first if the distortion is known.
 
     Args:
         width: channels of the networks.
@@ -72,8 +72,8 @@ class LearnedRelativePose(LearnedLayer):
             these steps: more steps bring them closer to those of the optimum where most correspondences are right.
         samples: minimal samples in the last stage.
 
-    Attributes and errors are those of :class:`~kornia_learnnorm.LearnedEightPoint`; with ``detach_stages`` there are no
-    minimal samples.
+    Attributes and errors are those of :class:`~kornia_learnnorm.LearnedEightPoint`; ``detach_stages`` also turns off
+    the minimal samples.
 
     Example:
         >>> layer = LearnedRelativePose(width=16, depth=2)
@@ -85,7 +85,7 @@ class LearnedRelativePose(LearnedLayer):
     model_name = Essential.name
     architecture = ("width", "depth", "stages", "refine_steps", "samples")
     features, residual_features = LearnedLayer.features + 5, LearnedLayer.residual_features + 1
-    outputs = 1  # the logarithm of the robust scale's factor
+    outputs = 1  # logarithm of a factor on the scale of the robust loss
     learn_transforms = False
 
     def __init__(
@@ -145,7 +145,7 @@ class LearnedRelativePose(LearnedLayer):
         r"""Return essential matrices, poses, the inlier probabilities and the result of each stage.
 
         Arguments, shapes and errors are those of :meth:`~kornia_learnnorm.LearnedEightPoint.estimate`, with
-        :math:`N \ge 5`; the cameras are needed. Points are pixels, or those of cameras with a focal length below 10
+        :math:`N \ge 5`; the cameras are required. Points are pixels; with a mean focal length below 10, they count as
         normalised coordinates.
 
         Returns:
@@ -185,7 +185,7 @@ class LearnedRelativePose(LearnedLayer):
         determined, gap = _determined(problem)
         solved, C1, C2, rows, eye = problem, K1, K2, determined[:, None], torch.eye(3).to(K1)
         if not is_known_true(determined.all()):
-            solved = problem.with_generic_points(determined)  # the result of these is dropped
+            solved = problem.with_generic_points(determined)  # the results of the generic points are dropped
             C1, C2 = (torch.where(rows[..., None], K, eye) for K in (K1, K2))
         with inference_mode():
             pieces = [run_pose_stages(self, *piece) for piece in in_pieces(solved, C1, C2, scores)]

@@ -78,9 +78,9 @@ def find_fundamental(
 
 
 def _inference_mode(normalizer: Normalizer | None) -> AbstractContextManager[object]:
-    """Return inference mode where gradients are disabled; not for others than closed forms.
+    """Return inference mode if gradients are disabled and the normaliser is a closed form, else a null context.
 
-    What they may keep of it would be of no use in training.
+    Another normaliser may cache tensors, and inference tensors cannot be used in training.
     """
     return inference_mode() if normalizer is None or type(normalizer) in CLOSED_FORMS else nullcontext()
 
@@ -98,7 +98,7 @@ def solve_in_coordinates(problem: LinearProblem, T1: Tensor, T2: Tensor) -> Tens
     M = unit_matrix(problem.model.constrain_in(problem, null_matrix, T1, T2))
     if not torch.is_grad_enabled():
         return M
-    # Rounding chose among the solutions; one with an epipole on a point makes the loss as steep as rounding is small.
+    # Rounding chose this solution. If its epipole happens to lie on a point, gradients would be arbitrarily large.
     return torch.where((gap > DEPENDENT_GAP[gap.dtype])[:, None, None], M, M.detach())
 
 

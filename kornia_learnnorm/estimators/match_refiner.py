@@ -11,21 +11,21 @@ from kornia_learnnorm.geometry import checks
 from kornia_learnnorm.pretrained import check_architecture, load_module, save_module
 
 FORMAT = "kornia_learnnorm.match_refiner.v1"
-WINDOWS = (1.0, 1.7, 3.0)  # pixels, standard deviations of the windows of Lucas-Kanade before training
-RANGE_ROUNDING = 1e-5  # by which interpolated grey values may exceed one
-NEIGHBOURHOOD = 60.0  # pixels, standard deviation of the distance of neighbours in both views
+WINDOWS = (1.0, 1.7, 3.0)  # pixels, initial standard deviations of the Lucas-Kanade windows, which are trained
+RANGE_ROUNDING = 1e-5  # amount by which interpolated grey values may exceed one
+NEIGHBOURHOOD = 60.0  # pixels, standard deviation of the Gaussian weights of neighbouring matches
 MAX_NEIGHBOURS = 256
-ORDER = 1.0, 0.6, 1.0, 0.6  # direction along which neighbours are spread, alike in both views
-NEGLIGIBLE = -60.0  # logarithm of the weight of a neighbour, against that of the nearest one, that has no effect
-ABSENT = -1e9  # logarithm of the weight of neighbours that are masked; finite, also where all are
-FRAME_PRIOR = 6.0  # pixels, standard deviation of the spread that is added to neighbours, where the affinity is one
+ORDER = 1.0, 0.6, 1.0, 0.6  # direction along which matches are sorted to pick neighbours evenly, equal in both views
+NEGLIGIBLE = -60.0  # smallest logarithm of a neighbour's weight relative to the nearest one's
+ABSENT = -1e9  # logarithm of the weight of masked neighbours; finite, for sets where all are masked
+FRAME_PRIOR = 6.0  # pixels, standard deviation added to the spread of neighbours; it pulls affinities to the identity
 FRAME_FLOOR = 1e-12  # added under a root
-MAX_AREA = 3.0  # by which an affinity may enlarge or reduce
-MIN_TRACE = 0.5  # of an affinity divided by the root of its determinant; less is a turn by more than some 75 degrees
-LARGEST_STEP = 3.0  # pixels, the bound of what Lucas-Kanade gives in one window
+MAX_AREA = 3.0  # largest factor by which an affinity may enlarge or reduce areas
+MIN_TRACE = 0.5  # of an affinity over the root of its determinant; less is a rotation by more than about 75 degrees
+LARGEST_STEP = 3.0  # pixels, bound on the Lucas-Kanade step of one window
+MAX_OUTSIDE = 0.2  # of the points of a view; more suggest pixels of a resized image
 # Of patches with a variance of one:
-MAX_OUTSIDE = 0.2  # of the points of a view; more are pixels of another size of its image
-NOISE = 1e-2  # added to the moments of the gradients, so that patches without texture give no step
+NOISE = 1e-2  # added to the squared gradients, so that patches without texture give no step
 FLOOR = 1e-3  # of the differences under their logarithm
 VARIANCE_FLOOR = 1e-4  # of the grey values of a patch, from 0 to 1
 
@@ -61,7 +61,7 @@ class MatchRefiner(nn.Module):
         bound: largest change of the displacement between both points, pixels; each moves by half of it.
 
     Attributes:
-        passes: number of refinements, 1 unless set; 2 help coarse matches.
+        passes: number of refinement passes, initially 1; 2 help with coarse matches.
         trained_on: names of the data that the weights were trained on, saved with them; empty if unknown.
 
     Raises:
@@ -89,8 +89,8 @@ class MatchRefiner(nn.Module):
         self.patch_size, self.width, self.bound = patch_size, width, bound
         pixels, windows = patch_size**2, len(WINDOWS)
         self.log_windows = nn.Parameter(torch.tensor(WINDOWS).log())
-        self.even = nn.Linear(pixels + 3 * windows + 1, width)  # of what swapping the views keeps
-        self.odd = nn.Linear(pixels + 2 * windows, width, bias=False)  # of what swapping the views negates
+        self.even = nn.Linear(pixels + 3 * windows + 1, width)  # features that swapping the views leaves unchanged
+        self.odd = nn.Linear(pixels + 2 * windows, width, bias=False)  # features that swapping the views negates
         self.hidden = nn.Linear(width, width)
         self.shift = nn.Linear(width, 2, bias=False)
         self.gates = nn.Linear(width, windows + 1)  # weights of the steps, and the logarithm of the noise
@@ -190,7 +190,7 @@ class MatchRefiner(nn.Module):
         return _bounded(shift, self.bound), gates[:, -1]
 
     def _lucas_kanade(self, mean: Tensor, difference: Tensor) -> tuple[Tensor, Tensor]:
-        """Return a step in each window, (B, K, 2, N), and statistics that tell how far to trust it, (B, 3 K, N)."""
+        """Return a step in each window, (B, K, 2, N), and statistics of its reliability, (B, 3 K, N)."""
         size = self.patch_size
         line = (torch.arange(1, size - 1, dtype=mean.dtype, device=mean.device) - size // 2).square()
         squared = (line[:, None] + line).flatten()
@@ -248,7 +248,7 @@ def _check_inside(number: int, image: Tensor, points: Tensor) -> None:
 
 
 def _linear(layer: nn.Linear, values: Tensor) -> Tensor:
-    """Return a layer's output for values (B, C, N): with the matches last, all loops are long."""
+    """Return a layer's output for values (B, C, N): with the matches last, inner loops are long."""
     weight = layer.weight.expand(len(values), -1, -1)
     return weight @ values if layer.bias is None else torch.baddbmm(layer.bias[:, None], weight, values)
 
@@ -256,11 +256,11 @@ def _linear(layer: nn.Linear, values: Tensor) -> Tensor:
 def local_frames(points1: Tensor, points2: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
     r"""Return frames :math:`A^{-1/2}` and :math:`A^{1/2}`, (B, N, 2, 2) x 2, of the affinities of neighbouring matches.
 
-    :math:`A` maps the surroundings of a match from the first view to the second. It is
-    :math:`C_2^{1/2} R\, C_1^{-1/2}` of the covariances :math:`C_1` and :math:`C_2` of neighbouring matches in a view,
-    with the rotation :math:`R` nearest to :math:`C_2^{-1/2} C_{21} C_1^{-1/2}`: swapping the views gives the inverse.
-    Neighbours have Gaussian weights of their distance in both views, so that false matches count little. Of more than
-    256 matches, 256 are neighbours, evenly spread. An affinity that is not plausible is replaced by the identity.
+    :math:`A = C_2^{1/2} R\, C_1^{-1/2}` maps the surroundings of a match from the first view to the second. :math:`C_1`
+    and :math:`C_2` are the covariances of the neighbouring matches in each view, and :math:`R` is the rotation nearest
+    to :math:`C_2^{-1/2} C_{21} C_1^{-1/2}`. Swapping the views inverts :math:`A`. Neighbours are weighted by a Gaussian
+    of their distance in both views, so that false matches count little; among more than 256 matches, 256 evenly spread
+    ones are the neighbours. An implausible affinity is replaced by the identity.
     """
     joint = torch.cat([points - points.mean(1, keepdim=True) for points in (points1, points2)], -1)
     near, exponent = _neighbours(joint, mask)
@@ -288,7 +288,7 @@ def local_frames(points1: Tensor, points2: Tensor, mask: Tensor | None = None) -
 def _neighbours(joint: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
     """Return at most 256 matches (B, K, 4) of (B, N, 4), and the logarithms of the factors of their weights, (B, K).
 
-    The weights are exp(-d^2 / 2 s^2); the factor of the other match is the same for all neighbours.
+    The weights are exp(-d^2 / 2 s^2); a factor that depends on the other match alone cancels and is left out.
     """
     number = min(joint.shape[1], MAX_NEIGHBOURS)
     index = torch.arange(number, device=joint.device)

@@ -36,7 +36,7 @@ def correspondences_from_matches(
     keypoints1, keypoints2 = _keypoints("keypoints1", keypoints1), _keypoints("keypoints2", keypoints2)
     if isinstance(matches, Mapping):
         if scores is not None:
-            raise ValueError("scores must be those of the mapping of matches, got others too")
+            raise ValueError("scores must be those of the mapping of matches: leave out the argument scores")
         matches, scores = _from_mapping(matches)
     if isinstance(matches, Tensor):
         matches, scores = _pairs_of_matches(keypoints1, matches, scores)
@@ -54,7 +54,7 @@ def correspondences_from_matches(
     index = pad_sequence([*matches, keypoints1.new_zeros(length, 2, dtype=torch.int64)], batch_first=True)[:-1].long()
     present = torch.tensor([len(pairs) for pairs in matches], device=index.device)
     mask = torch.arange(length, device=index.device) < present[:, None]
-    # A view without any keypoint gets one at the origin: padded rows take the first.
+    # A view without keypoints gets one at the origin: padded rows index the first keypoint.
     views = (pad(keypoints, (0, 0, 0, int(keypoints.shape[1] == 0))) for keypoints in (keypoints1, keypoints2))
     matched = zip(views, index.unbind(-1), strict=True)
     points1, points2 = (view.gather(1, rows[..., None].expand(-1, -1, 2)) for view, rows in matched)
@@ -67,7 +67,7 @@ def correspondences_from_matches(
 class MatchLayer(nn.Module):
     """Base class of all layers: takes the output of matching networks, refuses ``torch.jit``."""
 
-    scores_are = "weights"  # what the scores of matches are to `estimate`, "weights" or "scores"
+    scores_are = "weights"  # argument of `estimate` that takes the scores of matches, "weights" or "scores"
     takes_cameras = True
     estimate: Callable[..., Any]
 

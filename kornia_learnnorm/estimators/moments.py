@@ -1,8 +1,8 @@
 r"""Robust fits of matrices :math:`x_2^\top M x_1 = 0` to the second moments of the correspondences' design rows.
 
-Correspondences enter a step through the :math:`9 \times 9` matrix of the second moments of their rows alone,
-:math:`\sum_i w_i a_i a_i^\top`, and through the moments of their points: it costs little for ten matches and for
-thousands. Fundamental and essential matrices share all of it; the state says on which manifold the steps stay.
+A step needs only the :math:`9 \times 9` matrix of the second moments of the rows, :math:`\sum_i w_i a_i a_i^\top`, and
+the moments of the points: it is cheap even for thousands of matches. The code is the same for fundamental and essential
+matrices; the state determines the manifold.
 """
 
 from collections.abc import Callable
@@ -17,12 +17,12 @@ from kornia_learnnorm.geometry.dlt import ENTRIES, normal_equations, point_produ
 from kornia_learnnorm.models.essential import Calibrated
 
 SQUARE_FLOOR = 1e-10  # of the frame's unit squared, added to squared distances before their logarithm
-NORMAL_FLOOR = 1e-4  # of the norm of the matrix, added to that of each line's normal
+NORMAL_FLOOR = 1e-4  # of the norm of the matrix, added to the norm of each line's normal
 SquareScale = Callable[[Tensor], Tensor]  # from squared distances (B, S, N) to the squared scale of a loss
 
 
 class Evidence(NamedTuple):
-    """Correspondences in the common frame, and what their Sampson distances under matrices are made of."""
+    """Correspondences in the common frame, and the terms of their Sampson distances."""
 
     x1: Tensor  # homogeneous points, (B, 3, N)
     x2: Tensor
@@ -39,7 +39,7 @@ class Evidence(NamedTuple):
         return Evidence(*[value.gather(2, index[:, None].expand(-1, value.shape[1], -1)) for value in self])
 
     def single(self) -> "Evidence":
-        """Return the same in float32, which is enough to compare matrices."""
+        """Return the evidence in float32, which is enough to compare matrices."""
         return Evidence(*map(Tensor.float, self))
 
     def squares(self, F_mat: Tensor) -> tuple[Tensor, Tensor]:
@@ -63,7 +63,7 @@ class Evidence(NamedTuple):
     def forms(self, share: Tensor, squares: Tensor, products: Tensor) -> tuple[Tensor, Tensor]:
         """Return the matrices M and M - X of a step (:func:`descend`) over the trace of M, each (B S, 9, 9).
 
-        Of weights times gradient factors, and of squared distances, both (B, S, N), and of :func:`row_products`.
+        ``share`` are weights times gradient factors, (B, S, N) as ``squares``; ``products`` are :func:`row_products`.
         """
         M, points = row_moments(share, products).flatten(0, 1), (share * squares) @ self.products.mT
         X = (points @ _FORMS.to(M)).view_as(M)
@@ -97,13 +97,13 @@ def descend(
 ) -> Any:
     r"""Return the states of matrices, S of each set, after steps of reweighted least squares; differentiable.
 
-    Each is a Gauss-Newton step on :math:`e^\top (M - X) e` of new weights. With squared distances
-    :math:`(e^\top a_i)^2 / e^\top B_i e` and factors held, the moments
-    :math:`M = \sum_i w_i a_i a_i^\top / e^\top B_i e` alone have another optimum:
-    :math:`X = \sum_i w_i (e^\top a_i)^2 B_i / (e^\top B_i e)^2` is what the factors add to the gradient.
+    Each step computes the weights anew and takes a Gauss-Newton step on :math:`e^\top (M - X) e`. Squared distances are
+    :math:`(e^\top a_i)^2 / e^\top B_i e`. With the denominators held fixed, the moments
+    :math:`M = \sum_i w_i a_i a_i^\top / e^\top B_i e` alone would have another optimum:
+    :math:`X = \sum_i w_i (e^\top a_i)^2 B_i / (e^\top B_i e)^2` is what the denominators add to the gradient.
 
     States hold (B S) matrices, weights are (B, S, N). ``square_scale`` gives the squared scale of Geman and McClure's
-    loss, (B, S or 1, 1), from the squared distances (B, S, N). Steps are ``relaxation`` times Gauss and Newton's.
+    loss, (B, S or 1, 1), from the squared distances (B, S, N). Steps are ``relaxation`` times the Gauss-Newton step.
 
     Reference:
         W. Chojnacki, M. Brooks, A. van den Hengel, D. Gawley, On the fitting of surfaces to data with covariances,
@@ -133,8 +133,8 @@ def geometric_scale(inliers: Tensor, dof: int, floor: Tensor | float, near: floa
     It is the geometric mean over correspondences weighted by ``inliers`` (B, N), times :math:`n / (n - p)` of
     :math:`n = (\sum_i w_i)^2 / \sum_i w_i^2` effective correspondences, at least :math:`p + 1`, and ``dof`` parameters
     :math:`p`: a matrix that was fitted to few correspondences leaves distances that are too small. ``floor`` is added
-    to the squared distances. With ``near``, the mean is taken twice, the second time with weights that fall off at so
-    many times the first one: outliers with large weights, far away, would make it several times too large.
+    to the squared distances. With ``near``, the mean is computed twice, the second time with weights that fall off
+    beyond ``near`` times the first: distant outliers with large weights would make it several times too large.
     """
     share = (inliers / safe_divisor(inliers.sum(1, keepdim=True)))[:, None]
     number = (1 / safe_divisor(share.square().sum(2, keepdim=True))).clamp(min=dof + 1.0)
@@ -152,7 +152,7 @@ def geometric_scale(inliers: Tensor, dof: int, floor: Tensor | float, near: floa
 
 
 def least_cost(M: Tensor, real: Tensor, losses: Tensor, weights: Tensor, number: int) -> Tensor:
-    """Return the real matrices of least weighted sums of losses (B, S, N), (B, number, 3, 3)."""
+    """Return the real matrices with the least weighted sums of losses (B, S, N), (B, number, 3, 3)."""
     cost = (losses @ weights.to(losses)[..., None])[..., 0]
     cost = torch.where(real & cost.isfinite(), cost, torch.inf)
     best = cost.topk(min(number, cost.shape[1]), 1, largest=False).indices
@@ -160,7 +160,7 @@ def least_cost(M: Tensor, real: Tensor, losses: Tensor, weights: Tensor, number:
 
 
 def pick(state: Any, index: Tensor, number: int) -> Any:
-    """Return, of ``number`` states of each set, those of given indices (B,)."""
+    """Return one state for each set, at ``index`` (B,) among the ``number`` states of the set."""
     rows = index + number * torch.arange(index.shape[0], device=index.device)
     return type(state)(*[value[rows] for value in state])
 

@@ -1,7 +1,7 @@
-r"""What the stages of :class:`~kornia_learnnorm.LearnedEightPoint` read of a set of correspondences.
+r"""Input features of the networks of :class:`~kornia_learnnorm.LearnedEightPoint` and the other learned layers.
 
-Features don't change when both images are moved or scaled by one factor. The views come in a canonical order, so that
-swapping them changes nothing but which one is called the first. Networks see the second upright to the first.
+Features are invariant to a translation and a scale that are common to both images. The views are put in a canonical
+order, so that swapping them has no effect, and the second is rotated upright with respect to the first.
 """
 
 from typing import NamedTuple
@@ -14,8 +14,8 @@ from kornia_learnnorm.models.two_view_model import TwoViewModel
 
 POINT_FEATURES, RESIDUAL_FEATURES = 9, 5  # numbers of a correspondence
 RESIDUAL_FLOOR = 1e-5  # of the frame's unit, added to distances before their logarithm
-DEVIATION_FLOOR = 1e-5  # of the frame's unit: the rounding of an exact shift of the image says nothing
-# Of a length: the second derivative of a root at zero is not finite.
+DEVIATION_FLOOR = 1e-5  # of the frame's unit: below it, deviations from an exact shift of the image are rounding
+# Of a squared length: the second derivative of a root at zero is not finite.
 MIN_SQUARE = {torch.float32: 1e-24, torch.float64: 1e-200}
 MIN_PROBABILITY = 1e-3  # added to the probabilities of inliers in a mean
 FAR_FROM_CHANCE = 1.5  # correlations of rotated views, in root mean squares of those of random matches
@@ -56,7 +56,7 @@ class CommonFrame(NamedTuple):
 
 
 def upright_rotation(frame: CommonFrame, present: Tensor | None) -> Tensor:
-    """Return the rotations (B, 3, 3) that set the view upright that comes second in the canonical order.
+    """Return the rotations (B, 3, 3) that turn the second view, in canonical order, upright relative to the first.
 
     The least-squares rotation between two sets of points has the angle of their correlation as complex numbers (B.
     Horn, Closed-form solution of absolute orientation using unit quaternions, 1987). Views that are rotated by up
@@ -79,8 +79,8 @@ def upright_rotation(frame: CommonFrame, present: Tensor | None) -> Tensor:
 def match_features(frame: CommonFrame, upright: Tensor, scores: Tensor | None, present: Tensor | None) -> Tensor:
     r"""Return the features of correspondences before any matrix is known, :math:`(B, N, 9)`.
 
-    Both points, their displacement from the median displacement over the median deviation, the score and whether there
-    is one, and the number of correspondences. The rotations ``upright`` turn the second view about its mean.
+    They are both points, their displacement minus the median one, over the median deviation, the score and whether
+    there is one, and the number of correspondences. The rotations ``upright`` turn the second view about its mean.
     """
     swapped = frame.swapped[:, None, None]
     first, second = torch.where(swapped, frame.x2, frame.x1), torch.where(swapped, frame.x1, frame.x2)
@@ -106,7 +106,7 @@ def residual_features(
     """Return the features of correspondences under a matrix, :math:`(B, N, 5)`, and gradient factors, :math:`(B, N)`.
 
     The features are the distance, its ratios to the median and to the geometric mean over the inliers, and the gradient
-    factor, all as logarithms, and the logit before. The mean is weighted by the probabilities of the logits.
+    factor, all as logarithms, and the previous logit. The mean is weighted by the probabilities of the logits.
     The gradient factor turns squared algebraic residuals into squared distances; its median is one.
 
     Points are homogeneous, :math:`(B, 3, N)`, and matrices :math:`(B, 3, 3)`, both in the frame; logits :math:`(B, N)`

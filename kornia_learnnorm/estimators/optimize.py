@@ -1,7 +1,7 @@
 """Robust Levenberg-Marquardt over a model's manifold, batched: to convergence, or a fixed number of steps.
 
-Matrices move in coordinates that are Hartley's up to the scale of homogeneous vectors: pixels from the centroid, and a
-third coordinate as large as they are. Distances in them are those in pixels.
+Coordinates are Hartley's up to the scale of homogeneous vectors: pixels relative to the centroid, with a third
+coordinate of their size. Distances in them are distances in pixels.
 """
 
 from collections.abc import Callable
@@ -14,13 +14,13 @@ from kornia_learnnorm.estimators.robust_losses import GemanMcClure, Loss
 from kornia_learnnorm.geometry.checks import needs_gradient
 from kornia_learnnorm.models.two_view_model import Residuals, State, TwoViewModel
 
-FIRST_DAMPING = 1e-3  # of the diagonal of the normal matrix, added to it in the first step
-PLAIN_STEPS = 10  # steps before they are lengthened
-MIN_RATE, MAX_RATE = -0.5, 0.9  # of the length of a step over that of the one before
+FIRST_DAMPING = 1e-3  # damping of the first step, relative to the diagonal of the normal matrix
+PLAIN_STEPS = 10  # steps before extrapolation starts
+MIN_RATE, MAX_RATE = -0.5, 0.9  # bounds on the ratio of a step to the one before it
 MAX_DAMPING = 1e8  # no step that is damped this much changes the cost by more than rounding
-MIN_PIVOT = 1e-5  # smallest diagonal entry of the Hessian's Cholesky factor, of unit rows, where it is definite
+MIN_PIVOT = 1e-5  # smallest diagonal entry of the Cholesky factor of a definite Hessian, scaled to a unit diagonal
 UNROLLED_LOSS = GemanMcClure()  # of distances over their scale
-UNROLLED_SCALE = 3.0  # of the unrolled loss over the geometric mean of the distances, corrected for the parameters
+UNROLLED_SCALE = 3.0  # of the unrolled loss, in geometric means of the distances, corrected for the degrees of freedom
 DISTANCE_FLOOR = 1e-5  # of the points' unit, added to distances before their logarithm
 
 
@@ -32,7 +32,7 @@ class RobustCost(NamedTuple):
     x2: Tensor
     weights: Tensor  # of the losses, (B or 1, N)
     loss: Loss  # of squared distances
-    relaxation: float = 1.0  # of a step; a bounded loss curves less than its weights say
+    relaxation: float = 1.0  # factor on a step: a bounded loss has less curvature than its weights imply
 
     def select(self, rows: Tensor) -> "RobustCost":
         """Return the cost of some of the matrices."""
@@ -42,7 +42,7 @@ class RobustCost(NamedTuple):
 
 
 class Optimum(NamedTuple):
-    """States, costs, normal equations, convergence, damping of the next steps, number of past steps, and the last."""
+    """States, costs, normal equations, convergence, damping of the next steps, number of steps tried, last step."""
 
     state: Any
     cost: Tensor
@@ -54,18 +54,18 @@ class Optimum(NamedTuple):
     step: Tensor  # (B, P); zero after one that was refused
 
     def map(self, function: Callable[..., Tensor], *others: "Optimum") -> "Optimum":
-        """Return what a function makes of each tensor and its counterparts in others."""
+        """Return the optimum with a function applied to each tensor and its counterparts in others."""
         states = zip(self.state, *(other.state for other in others), strict=True)
         state = type(self.state)(*(function(*values) for values in states))
         return Optimum(state, *(function(*values) for values in zip(self[1:], *(o[1:] for o in others), strict=True)))
 
 
 def minimize(cost: RobustCost, state: State, max_iterations: int, tolerance: float) -> tuple[Tensor, Optimum]:
-    """Return the costs at the states and the best found from there, on the manifold that the states belong to.
+    """Return the costs at the initial states and the optima found from them, on the manifold of the states.
 
-    It runs to convergence, with a damping of its own for every matrix; its gradient is that of :func:`attach_gradient`.
+    Every matrix has a damping of its own and runs to convergence. For gradients, see :func:`attach_gradient`.
     """
-    # What a step computes of so many correspondences stays in the cache of a CPU: 2.5 times faster than all at once.
+    # In chunks whose intermediate results stay in the cache of a CPU: 2.5 times faster than all at once.
     matrices = state.matrix()
     size = max(1, (2**14 if matrices.device.type == "cpu" else 2**24) // cost.x1.shape[-1])
     if len(matrices) > size:
@@ -86,7 +86,7 @@ def _descend(cost: RobustCost, best: Optimum, max_iterations: int, tolerance: fl
         count = int(active.sum())
         if count == 0:
             break
-        if 2 * count <= len(active):  # only some go on
+        if 2 * count <= len(active):  # at most half go on
             rows = torch.nonzero(active)[:, 0]
             part = best.map(lambda value, rows=rows: value[rows])
             part = _descend(cost.select(rows), part, max_iterations - iteration, tolerance)
@@ -98,7 +98,7 @@ def _descend(cost: RobustCost, best: Optimum, max_iterations: int, tolerance: fl
 def _try_step(cost: RobustCost, best: Optimum, active: Tensor, tolerance: float) -> Optimum:
     added = best.normal.diagonal(dim1=-2, dim2=-1) * best.damping[:, None]
     step = torch.linalg.solve_ex(best.normal + torch.diag_embed(added), best.gradient)[0]
-    # What is left to the optimum is about a geometric series, whose ratio the last two steps tell (Aitken).
+    # The remaining steps are about a geometric series with the ratio of the last two (Aitken's extrapolation).
     rate = (step * best.step).sum(-1) / best.step.square().sum(-1).clamp(min=torch.finfo(step.dtype).tiny)
     rate = torch.where(best.iterations < PLAIN_STEPS, 0.0, rate.clamp(MIN_RATE, MAX_RATE))
     state = best.state.retract(-(cost.relaxation / (1 - rate))[:, None] * step)
@@ -130,7 +130,7 @@ def _normal_equations(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return costs (B,), normal matrices (B, P, P), gradients (B, P) and weighted sums of squares (B,).
 
-    Of distances (B, C N), their derivatives by the matrices' entries, (B, 9, C N), and these along tangents, (B, 9, P).
+    Arguments are distances (B, C N), their derivatives J by the matrices' entries, (B, 9, C N), and tangents (B, 9, P).
     """
     components = cost.model.components
     squares = distance.square() if components == 1 else cost.model.squares(distance)
@@ -143,7 +143,7 @@ def _normal_equations(
 
 
 def attach_gradient(cost: RobustCost, optimum: Optimum) -> State:
-    """Return the optimum's states with the derivatives that it has by the implicit function theorem."""
+    """Return the states of an optimum with derivatives by the implicit function theorem."""
     state: State = optimum.state
     step = optimum.gradient.new_zeros(optimum.gradient.shape).requires_grad_()
     residual = cost.model.residual(state.retract(step).matrix(), cost.x1, cost.x2)
@@ -186,7 +186,7 @@ def refine_unrolled(model: TwoViewModel, x1: Tensor, x2: Tensor, M: Tensor, weig
     total, normal, gradient, _ = _normal_equations(cost, distance, J, state.tangents())
     damping, eye = torch.full_like(scale, FIRST_DAMPING), torch.eye(model.dof, dtype=normal.dtype, device=normal.device)
     for _ in range(steps):
-        # The same for all directions, so that it does not depend on which view comes first.
+        # All directions are damped equally, so that swapping the views has no effect.
         size = normal.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)
         size = size + (size == 0)
         moved = state.retract(-torch.linalg.solve_ex(normal + (damping * size)[..., None] * eye, gradient)[0])
@@ -202,7 +202,7 @@ def refine_unrolled(model: TwoViewModel, x1: Tensor, x2: Tensor, M: Tensor, weig
 
 
 def choose(chosen: Tensor, states: Any, others: Any) -> Any:
-    """Return the states of a manifold where chosen, (B,) bool, else the other ones."""
+    """Return the states where ``chosen``, (B,) bool, is true, and the others elsewhere."""
     tensors = []
     for own, other in zip(states, others, strict=True):
         mask = chosen.view(-1, *[1] * (own.ndim - 1))
@@ -211,7 +211,7 @@ def choose(chosen: Tensor, states: Any, others: Any) -> Any:
 
 
 def differentiable_state(model: TwoViewModel, M: Tensor) -> Any:
-    """Return the states of matrices of unit norm, with the derivatives that a step on the manifold has."""
+    """Return the states of matrices of unit norm, differentiable along the manifold."""
     with torch.no_grad():
         state = model.state(M)
     if not needs_gradient(M):

@@ -25,25 +25,25 @@ from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.essential import Calibrated, Essential, nearest_essential
 from kornia_learnnorm.models.fundamental import Fundamental
 
-EARLY_STEPS, LOCAL_STEPS = 2, 3  # reweightings in all stages but the last, and of candidates, twice if not settled
-# Scales of the robust loss in geometric means of the distances: of all stages but the last and of the last, times the
-# network's factor, and of settled sets.
+EARLY_STEPS, LOCAL_STEPS = 2, 3  # reweighting steps of early stages, and from candidates (twice if not settled)
+# Scales of the robust loss in early stages and in the last one, in geometric means of the distances; the network
+# predicts a factor on them.
 EARLY_SCALE, LAST_SCALE = 3.0, 0.7
-# In evaluation, the means are those of near distances, up to about three means. Networks would learn slower by them.
+# Scales in evaluation, where means leave out distances beyond about NEAR means (networks learn slower), and if settled.
 NEAR, EARLY_NEAR_SCALE, LAST_NEAR_SCALE, SETTLED_SCALE = 3.0, 4.2, 1.0, 4.4
 SCALE_BOUND = 1.5  # the logarithm of the factor stays within plus and minus this
-LAST_POWER = 0.1  # of the probabilities in the last stage: most matches are to count, and a robust loss drops outliers
-RELAXATION = 1.3  # of a step: the curvature of a robust loss is less than its weights
-# With a mean focal length below the first, points are normalised coordinates, which count as pixels of the second.
+LAST_POWER = 0.1  # exponent of the probabilities in the last stage: nearly equal weights, as the loss rejects outliers
+RELAXATION = 1.3  # factor on a step: a robust loss has less curvature than its weights imply
+# With a mean focal length below MIN_FOCAL, points are normalised coordinates and count as pixels at NORMAL_FOCAL.
 MIN_FOCAL, NORMAL_FOCAL = 10.0, 1000.0
-MAX_RAY = 1e3  # of the features; far larger ones would overflow in the networks
+MAX_RAY = 1e3  # bound on the ray features, which could overflow in the networks
 EARLY_PIXELS, LAST_PIXELS = 2.0, 0.7  # scales of the losses that candidates are compared by
 PIXEL_FLOOR = 1e-3  # pixels, added to distances before their logarithm
-MIN_WEIGHT = 1e-6  # added to weights of which the largest is one
-MAX_SCORED = 256  # matches by which the matrices of minimal samples are compared first
-SHORTLIST = 6  # matrices of minimal samples that are compared on all matches
-# Where fewer of the matches are inliers, samples are drawn again from those so many pixels near the best matrix, if
-# there are as many.
+MIN_WEIGHT = 1e-6  # added to weights that are scaled to a maximum of one
+MAX_SCORED = 256  # matches on which the matrices of minimal samples are pre-scored
+SHORTLIST = 6  # best matrices of minimal samples, which are then compared on all matches
+# Below this share of inliers, samples are drawn again from the matches within NEAR_PIXELS of the best matrix, if there
+# are at least MIN_NEAR.
 FEW_INLIERS, NEAR_PIXELS, MIN_NEAR = 0.4, 14.0, 16
 
 Candidates = tuple[Tensor, Tensor]  # essential matrices (B, S, 3, 3), and which of them are real
@@ -54,7 +54,7 @@ def run_pose_stages(
 ) -> tuple[list[Calibrated], list[Tensor]]:
     """Return the states of the stages and their logits (B, N), for sets that determine their matrix.
 
-    In evaluation, sets of few outliers leave out the stages between the first network and the last fit.
+    In evaluation, sets with few outliers skip the stages between the first network and the last fit.
     """
     networks, detach_stages, present = layer.networks, layer.detach_stages, problem.present
     settle = layer.samples > 0 and not (layer.training or detach_stages)
@@ -92,14 +92,14 @@ def run_pose_stages(
         weights = logits.sigmoid()
         weights = weights / weights.detach().amax(1, keepdim=True) + MIN_WEIGHT
         power = weights**LAST_POWER
-        if problem.weights is not None:  # their ratios matter, not how many matches they seem to make
+        if problem.weights is not None:  # only their ratios matter, not their size
             given = problem.weights / safe_divisor(problem.weights.detach().amax(1, keepdim=True))
             weights, power = weights * given, power * given
         suggested = weights if factor is None else weights * factor
         found.append(logits)
         if len(found) == len(networks) or (is_known_true(settled.all()) and len(settled) > 0):
             break
-        with torch.no_grad():  # the states of least weighted cost among those that the weights suggest
+        with torch.no_grad():  # the candidates with the least weighted cost
             spans = matches.moment_spans(suggested[:, None])
             E_mat, real = _suggested(spans, _in_spans(spans), before)
             losses = matches.losses(E_mat, EARLY_PIXELS / unit)
@@ -144,7 +144,7 @@ class _Matches(NamedTuple):
         return lambda squares: scale.square()[:, None] * mean(squares)
 
     def moment_spans(self, weights: Tensor) -> Tensor:
-        """Return the likeliest four matrices of moments under weights (B, S, N), (B, S, 4, 3, 3), the best one last."""
+        """Return the four smallest eigenvectors (B, S, 4, 3, 3) of moments with weights (B, S, N), smallest last."""
         carry = torch.einsum("bik,bjl->bklij", self.model.C1, self.model.C2)  # of the entries of E to those of F
         carry = carry.flatten(3, 4).flatten(1, 2)[:, None]
         M = row_moments(weights, row_products(self.evidence.products))
@@ -154,16 +154,16 @@ class _Matches(NamedTuple):
     def most_consistent(
         self, weights: Tensor, suggested: Tensor, before: Candidates | None, samples: int, settled: Tensor
     ) -> tuple[Calibrated, Tensor]:
-        """Return the states of least cost of all matches, whatever their weights, and which matches are in front.
+        """Return the states with the least unweighted cost over all matches, and which matches are in front, (B, N).
 
         Candidates come from the moments with and without weights, and from minimal samples drawn by the weights. The
-        best are fitted to all matches. A match behind a camera, (B, N) bool, costs as much as one far away.
+        best are fitted to all matches. A match behind a camera costs as much as one far away.
         """
         (evidence, model, unit), present = self, (weights > 0).to(weights)
-        # Matches in the order of their weights: samples and choices don't depend on the order that they came in.
+        # Sort the matches by weight, so that samples and choices do not depend on the order of the input.
         order = weights.argsort(dim=1, descending=True, stable=True)
         scale = LAST_PIXELS / unit
-        few = (samples + 1) // 2  # are enough for a settled set
+        few = (samples + 1) // 2  # samples are enough for a settled set
         samples = few if is_known_true(settled.all()) else samples
         drawn, used = sample_null_spaces(evidence, weights, order, samples, Essential.sample_size)
         inverse1, inverse2 = (torch.linalg.inv_ex(C)[0][:, None, None] for C in (model.C1, model.C2))
@@ -198,7 +198,7 @@ class _Matches(NamedTuple):
     def search_near(
         self, weights: Tensor, state: Calibrated, front: Tensor, samples: int, settled: Tensor
     ) -> tuple[Calibrated, Tensor]:
-        """Return the states, where few matches agree with them those of a search among the matches near them."""
+        """Return the states; where few matches agree with them, search again among the matches near them."""
         if not samples or is_known_true(settled.all()):
             return state, front
         pixels = self.evidence.squares(state.matrix()[:, None])[0][:, 0].sqrt() * self.unit
@@ -212,7 +212,7 @@ class _Matches(NamedTuple):
         return choose(again, found, state), torch.where(again[:, None], found_front, front)
 
     def leave_cameras(self, state: Calibrated, weights: Tensor, square_scale: SquareScale, steps: int) -> Calibrated:
-        """Return the states, but the poses of fundamental matrices where correspondences contradict the cameras."""
+        """Return the states, or poses of fundamental matrices where the correspondences contradict the cameras."""
         evidence, model, unit = self
         with torch.no_grad():
             square = square_scale(evidence.squares(state.matrix()[:, None])[0])[:, 0]
@@ -222,7 +222,7 @@ class _Matches(NamedTuple):
         with torch.no_grad():
             start = Fundamental().state(state.matrix())
         free = descend(evidence, start, weights[:, None], square_scale, steps, RELAXATION)
-        # Between directions: there the matrix has derivatives by the cameras, and unit norm.
+        # As a matrix of viewing directions, it has derivatives with respect to the cameras, and unit norm.
         eye = Essential(torch.eye(3).to(model.C1)[None], torch.eye(3).to(model.C2)[None])
         inverse1, inverse2 = (torch.linalg.inv_ex(C)[0] for C in (model.C1, model.C2))
         nearest = model.attach(differentiable_state(eye, unit_matrix(inverse2.mT @ free.matrix() @ inverse1)))
@@ -232,7 +232,7 @@ class _Matches(NamedTuple):
 
 
 def _pixels_per_unit(K1: Tensor, K2: Tensor) -> Tensor:
-    """Return how many pixels the unit of the points has, (B, 1): one, but for normalised coordinates."""
+    """Return the pixels per unit of the points, (B, 1): one, except for normalised coordinates."""
     K = torch.stack([K1, K2]).detach()
     focal = (determinant(K).abs() / K[..., 2, 2] ** 3).sqrt().mean(0)[:, None]  # geometric mean along the axes
     return torch.where(focal < MIN_FOCAL, NORMAL_FOCAL / focal, 1.0)
@@ -255,7 +255,7 @@ def _in_spans(spans: Tensor) -> Candidates:
 
 
 def _suggested(spans: Tensor, found: Candidates, before: Candidates | None) -> Candidates:
-    """Return the matrices found in spans, those nearest to the likeliest ones, and those of the stage before."""
+    """Return the matrices found in spans, the nearest ones to the smallest eigenvectors, and the previous stage's."""
     nearest = nearest_essential(spans[:, :, 3].flatten(0, 1)).view_as(spans[:, :, 3])
     candidates = [found, (nearest, torch.ones_like(nearest[..., 0, 0], dtype=torch.bool))]
     candidates += [] if before is None else [before]

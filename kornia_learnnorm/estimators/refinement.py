@@ -64,16 +64,16 @@ def refine_fundamental(
         points1: pixels in the first image with shape :math:`(B, N, 2)`, :math:`N \ge 8`, float32 or float64; with shape
             :math:`(1, N, 2)`, all matrices share them.
         points2: pixels in the second image with the same shape.
-        F_mat: where to start, with shape :math:`(B, 3, 3)`, any scale but zero; of rank 3, it is first projected in
-            Hartley's coordinates.
+        F_mat: initial matrices with shape :math:`(B, 3, 3)`, any scale but zero; those of rank 3 are first projected
+            in Hartley's coordinates.
         weights: optional non-negative weights of the losses, :math:`(B, N)` or :math:`(1, N)` as the points; zero means
             absent.
         distance: the distance :math:`d`: ``"sampson"``, or ``"symmetric"`` (Fan et al., Eq. 8).
         loss: :math:`\rho` of squared distances: :func:`~kornia_learnnorm.estimators.robust_losses.squared_loss`,
             :class:`~kornia_learnnorm.Huber`, :class:`~kornia_learnnorm.Cauchy`,
             :class:`~kornia_learnnorm.GemanMcClure` or :class:`~kornia_learnnorm.Truncated`.
-        max_iterations: largest number of steps tried. Robust losses rarely take more than 50 among outliers; then there
-            is no gradient.
+        max_iterations: largest number of steps tried. With outliers, robust losses sometimes need more than 50; such a
+            result carries no gradient.
         tolerance: largest cosine between the distances and their derivatives at which a matrix has converged. 1e-3
             saves at least half of the steps and leaves the cost within about 0.2 % of the optimum: enough for an
             estimate, not for its gradient.
@@ -138,10 +138,10 @@ def refine_essential(
     Args:
         points1: pixels in the first image with shape :math:`(B, N, 2)` or :math:`(1, N, 2)`, :math:`N \ge 5`.
         points2: pixels in the second image with the same shape.
-        E_mat: where to start, with shape :math:`(B, 3, 3)`, any scale but zero; the nearest essential matrix is taken.
+        E_mat: initial matrices with shape :math:`(B, 3, 3)`, any scale but zero; made essential first.
         K1: cameras of the first images with shape :math:`(3, 3)` or :math:`(B, 3, 3)`.
         K2: cameras of the second images with shape :math:`(3, 3)` or :math:`(B, 3, 3)`.
-        weights: this and the next arguments as for :func:`~kornia_learnnorm.refine_fundamental`.
+        weights: see :func:`~kornia_learnnorm.refine_fundamental` for this argument and the following ones.
         loss: :math:`\rho` of squared distances.
         distance: the distance :math:`d`: ``"sampson"`` or ``"symmetric"``.
         max_iterations: largest number of steps tried.
@@ -195,7 +195,7 @@ def _cost(
     x1, x2 = points1.to(dtype), points2.to(dtype)
     weights = torch.ones_like(x1[..., 0]) if weights is None else weights.to(dtype)
     with torch.no_grad():
-        # Pixels from the centroid, and a third coordinate as large as they are: distances are those in pixels.
+        # Pixels relative to the centroid, and a third coordinate of their size: distances stay in pixels.
         T1, T2 = (T / T[:, :1, :1] for T in (hartley_coordinates(x, weights)[1] for x in (x1, x2)))
     x1, x2 = (T @ convert_points_to_homogeneous(x).mT for T, x in ((T1, x1), (T2, x2)))
     return RobustCost(Fundamental(distance=distance), x1, x2, weights, loss), T1, T2

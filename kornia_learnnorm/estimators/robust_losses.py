@@ -110,7 +110,7 @@ class Truncated(_RobustLoss):
 
 
 def check_loss(loss: object) -> None:
-    """Raise a clear TypeError for what is no loss, such as a class in place of its instance."""
+    """Raise a TypeError for anything but a callable, or for a class in place of its instance."""
     if isinstance(loss, type):
         raise TypeError(f"loss must be a function or an instance such as {loss.__name__}(1.0), got the class")
     if not callable(loss):

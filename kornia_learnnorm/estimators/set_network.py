@@ -66,9 +66,9 @@ class AttentiveContextBlock(nn.Module):
         z = self.norm(hidden)
         mean, deviation, maximum = set_statistics(z, self.attention(z), absent)
         context = self.context(maximum)
-        # Not where an adapter, say of low rank, has taken the layer's place.
+        # Only for a plain layer, not for an adapter (such as LoRA) in its place.
         if type(self.point) is nn.Linear and not torch.compiler.is_compiling() and z.shape[1] > z.shape[2]:
-            # The statistics go into a layer of each set, which then reads half as many numbers.
+            # Fold the statistics into one layer per set, which then reads half as many features.
             own, relative = self.point.weight.chunk(2, 1)
             relative = relative / deviation
             bias = self.point.bias + context - mean @ relative.mT
@@ -81,7 +81,7 @@ class AttentiveContextBlock(nn.Module):
 def set_statistics(features: Tensor, logits: Tensor, absent: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """Return attentive mean, attentive deviation and maximum over the set, each :math:`(B, 1, C)`.
 
-    Sets without any correspondence have some finite statistics.
+    The statistics of empty sets are arbitrary, but finite.
     """
     features = features.to(logits.dtype)
     absent = None if absent is None else absent[..., None]

@@ -1,4 +1,4 @@
-"""The stages of a learned layer: features, logits, weights and transforms, matrix; refined, the next stage's input."""
+"""The stages of a learned layer: network, weighted DLT, and the refinement that the next stage starts from."""
 
 from typing import Any
 
@@ -21,20 +21,20 @@ from kornia_learnnorm.geometry.transforms import spd_transform
 from kornia_learnnorm.models.two_view_model import TwoViewModel
 
 EARLY_STEPS = 3  # largest number of refinement steps in all stages but the last
-MAX_MINIMAL_DISTANCE = 0.01  # of the frame's unit; quadratic mean that the best fit of `min_points` inliers leaves
-MIN_WEIGHT = 1e-6  # added to weights of which the largest is one
+MAX_MINIMAL_DISTANCE = 0.01  # frame units; largest RMS distance that the best fit of `min_points` inliers leaves
+MIN_WEIGHT = 1e-6  # added to weights that are scaled to a maximum of one
 BOUND = 2.0  # the parameters of the transforms stay within plus and minus this
-MIN_SETTLED, SETTLED = 16, 0.7  # matches, and their mean probability, from which on the first stage is enough
+MIN_SETTLED, SETTLED = 16, 0.7  # matches, and mean probability, from which the first stage is enough
 TRANSFORM_PARAMS = 5  # of each view's SPD transform
-MAX_SETS_ON_GPU = 2000  # that are searched at once: PyTorch cannot decompose the matrices of 65,536 samples with CUDA
-MAX_MATCHES = 8192  # at once, whose features fit into a processor's cache
+MAX_SETS_ON_GPU = 2000  # searched at once: PyTorch cannot decompose the matrices of 65,536 samples with CUDA
+MAX_MATCHES = 8192  # processed at once on a CPU: their features fit into its cache
 
 
 def run_stages(layer: Any, problem: LinearProblem, scores: Tensor | None) -> tuple[Tensor, Tensor]:
     """Return matrices (B, S, 3, 3) and logits (B, S, N) of the stages, for sets that determine their matrix.
 
     Unless stages are detached, the refined matrices of the last stage follow. Sets that are settled after the first
-    stage keep what it gives in the others. All but the last change of coordinates is the common frame's.
+    stage keep its result in the others. All is computed in the common frame; the results are in pixels.
     """
     model, present, detach_stages = layer.model, problem.present, layer.detach_stages
     frame = CommonFrame.from_points(problem.points1, problem.points2, present)
@@ -74,7 +74,7 @@ def run_stages(layer: Any, problem: LinearProblem, scores: Tensor | None) -> tup
 
 
 def in_pieces(problem: LinearProblem, *values: Tensor | None) -> list[tuple[Any, ...]]:
-    """Return a problem and values of its sets in pieces, on a CPU those that it is fast on, in one with gradients."""
+    """Return a problem and values of its sets in pieces of a size that suits the device; in one for CPU gradients."""
     number, on_cpu = problem.x1.shape[0], problem.x1.device.type == "cpu"
     size = max(1, MAX_MATCHES // max(1, problem.x1.shape[1])) if on_cpu else MAX_SETS_ON_GPU
     if torch.compiler.is_compiling() or (on_cpu and torch.is_grad_enabled()) or number <= size:
@@ -113,12 +113,12 @@ def few_outliers(logits: Tensor, present: Tensor | None) -> Tensor:
 
 
 class Refinement:
-    """Robust refinement of a stage's matrices in the frame; sets of as few as possible matches are solved once.
+    """Robust refinement of a stage's matrices in the common frame; sets of ``min_points`` matches are solved once.
 
-    With ``settle``, sets of few outliers leave stages out: ``samples`` of the last one find what the others would.
+    With ``settle``, sets with few outliers skip stages: the ``samples`` of the last stage find as good a matrix.
     """
 
-    min_searched = 0  # matches of a set that is searched
+    min_searched = 0  # matches of the smallest set that is searched
 
     def __init__(
         self, model: TwoViewModel, problem: LinearProblem, frame: CommonFrame, samples: int = 0, settle: bool = False
@@ -134,9 +134,9 @@ class Refinement:
         self.minimal = _solve_minimal(model, problem, frame, self.x1, self.x2) if can_be_minimal else None
 
     def __call__(self, M: Tensor, logits: Tensor, steps: int, last: bool = False) -> tuple[Tensor, Tensor]:
-        """Return a stage's matrices after so many steps, and its logits."""
+        """Return a stage's matrices after ``steps`` steps, and its logits."""
         if self.minimal is not None and self.x1.shape[-1] == self.model.min_points:
-            # The stage has no effect; through the zero, its network, scores and weights still get a gradient of zero.
+            # The stage has no effect; adding zero times M gives its network, scores and weights a gradient of zero.
             return self.minimal + 0.0 * M, logits
         refined = self.optimize(M, logits.sigmoid(), steps, last)
         if self.minimal is not None and self.weights is not None:
@@ -148,20 +148,20 @@ class Refinement:
         """Return which sets need no stage but the first and its refinement, (B,) bool; None if all stages are run."""
         if self.settle and self.samples:
             self.few_outliers = few_outliers(logits, None if self.weights is None else self.weights > 0)
-            # Without determined sets the stages are run, so that all networks get gradients, of zero.
+            # Without determined sets all stages are run, so that every network gets a gradient (of zero).
             self.all_settled = is_known_true(self.few_outliers.all()) and len(self.few_outliers) > 0
         return self.few_outliers
 
     def optimize(self, M: Tensor, probability: Tensor, steps: int, last: bool) -> Tensor:
-        """Return the matrices after so many steps, with the probabilities of inliers; ``last`` in the last stage."""
+        """Return the matrices after ``steps`` steps, weighted by inlier probability; ``last`` in the last stage."""
         weights = probability if self.weights is None else probability * self.weights
         return refine_unrolled(self.model, self.x1, self.x2, M, weights, steps)
 
 
 def _solve_minimal(model: TwoViewModel, problem: LinearProblem, frame: CommonFrame, x1: Tensor, x2: Tensor) -> Tensor:
-    """Return the matrices, in the frame, of ``min_points`` matches; Hartley's where the best ones don't fit.
+    """Return the matrices, in the frame, of ``min_points`` matches; by projection where the best ones don't fit.
 
-    A best fit that leaves large distances is one of outliers. There the optimum of the first-order distances is, on
+    A best fit that leaves large distances is a fit to outliers. There the optimum of the first-order distances is, on
     average, worse than the projection in Hartley's coordinates.
     """
     T1, T2 = problem.T1 @ frame.inverse, problem.T2 @ frame.inverse

@@ -1,4 +1,4 @@
-"""Samples of the learned layers' searches: drawn by weights without a generator of random numbers, evenly spread."""
+"""Samples for the searches of the learned layers, drawn by weight from a low-discrepancy sequence."""
 
 import torch
 from torch import Tensor
@@ -6,8 +6,8 @@ from torch import Tensor
 from kornia_learnnorm.estimators.moments import Evidence
 from kornia_learnnorm.geometry.dlt import null_space
 
-MIN_PIVOT = 1e-6  # of the largest one, of a minimal sample that is not degenerate, such as by drawing a match twice
-LARGE_SAMPLE = 20  # matches of a sample that averages their noise: most are right in sets of few outliers
+MIN_PIVOT = 1e-6  # of the largest one; smaller in a degenerate minimal sample, such as one with a match twice
+LARGE_SAMPLE = 20  # matches of a large sample, which averages their noise where there are few outliers
 # Roots of x^(d + 1) = x + 1, by the size d of a sample.
 EVEN_ROOTS = {4: 1.1673039782614187, 5: 1.1347241384015194, 7: 1.0969815577985598, 20: 1.034397396133807}
 
@@ -15,14 +15,14 @@ EVEN_ROOTS = {4: 1.1673039782614187, 5: 1.1347241384015194, 7: 1.096981557798559
 def sample_null_spaces(
     evidence: Evidence, weights: Tensor, order: Tensor, number: int, size: int
 ) -> tuple[Tensor, Tensor]:
-    """Return the null spaces (B, S, 9 - size, 3, 3) of minimal samples, and which have no larger one, (B, S) bool."""
+    """Return the null spaces (B, S, 9 - size, 3, 3) of minimal samples, and which are not degenerate, (B, S) bool."""
     basis, pivots = null_space(_sample_rows(evidence, weights, order, number, size).mT)
     determined = pivots.amin(-1) > MIN_PIVOT * pivots.amax(-1)
     return torch.unflatten(basis.mT, -1, (3, 3)).mT, determined
 
 
 def fit_samples(evidence: Evidence, weights: Tensor, order: Tensor, number: int) -> Tensor:
-    """Return the likeliest matrices of samples of 20 matches, (B, S, 3, 3)."""
+    """Return the least-squares matrices of samples of 20 matches, (B, S, 3, 3)."""
     rows = _sample_rows(evidence, weights, order, number, LARGE_SAMPLE)
     return torch.unflatten(torch.linalg.eigh(rows @ rows.mT)[1][..., 0], -1, (3, 3)).mT
 
@@ -37,8 +37,8 @@ def _sample_rows(evidence: Evidence, weights: Tensor, order: Tensor, number: int
 def draw_matches(weights: Tensor, order: Tensor, number: int, size: int) -> Tensor:
     """Return the correspondences of samples drawn by weights, indices (B, number size), one sample after another.
 
-    ``order`` (B, N) sorts the correspondences by their weights (B, N). The samples are those of multiples of the powers
-    of the root of :math:`x^{d + 1} = x + 1` for d = ``size``, which spread evenly (M. Roberts, 2018).
+    ``order`` (B, N) sorts the correspondences by their weights (B, N). Match j of sample k is drawn at the fractional
+    part of :math:`k r^{-j}`, where :math:`r^{d + 1} = r + 1`, d = ``size``, spreads evenly (M. Roberts, 2018).
     """
     shares = weights.gather(1, order).cumsum(1)
     shares = shares / shares[:, -1:]
@@ -49,9 +49,9 @@ def draw_matches(weights: Tensor, order: Tensor, number: int, size: int) -> Tens
 
 
 def evenly_ranked(order: Tensor, present: Tensor, most: int) -> Tensor:
-    """Return at most so many of sorted correspondences (B, N), evenly over the ranks of those present, which are first.
+    """Return at most ``most`` of the sorted correspondences (B, N), evenly spaced over the ranks of the present ones.
 
-    ``present`` (B, N) is one for them and zero for others: how many others there are has no effect.
+    ``present`` (B, N) is one for these, which come first, and zero for others, whose number has no effect.
     """
     few = min(order.shape[1], most)
     number = present.sum(1, keepdim=True, dtype=torch.int64).clamp(min=few)
