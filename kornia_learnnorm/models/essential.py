@@ -2,8 +2,8 @@ r"""The essential matrix as a two-view model: two equal singular values, five de
 
 It is a fundamental matrix :math:`F = C_2^\top E C_1` of known cameras: distances are those in pixels. On the manifold
 of :class:`~kornia_learnnorm.models.fundamental.Rank2` the matrix :math:`A` of :math:`E` is a rotation over
-:math:`\sqrt 2`. Of the three turns of a step, the first alone keeps it one: the step has the five parameters of a
-relative pose.
+:math:`\sqrt 2`. Of the three turns in a step, only the first keeps :math:`A` of this form, so a step has the five
+parameters of a relative pose.
 """
 
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ class Essential(Fundamental):
     name = "essential"
     dof = 5
     sample_size = 5
-    confidence = 0.999  # cameras leave noise less room
+    confidence = 0.999  # known cameras reduce the effect of noise on a sample
 
     def __init__(self, C1: Tensor, C2: Tensor, distance: Distance = "sampson") -> None:
         super().__init__(distance=distance)
@@ -63,7 +63,7 @@ class Essential(Fundamental):
         return state._replace(C1=self.C1.expand_as(state.C1), C2=self.C2.expand_as(state.C2))
 
     def solve_samples(self, x1: Tensor, x2: Tensor, shift: float) -> Tensor:
-        """Return the matrices of samples of five, up to ten each; degenerate ones have none, five on one plane have."""
+        """Return the matrices of samples of five, up to ten each, and none of degenerate ones; planes aren't degenerate."""
         Q, R = torch.linalg.qr(design_matrix(x1 @ self.C1.mT, x2 @ self.C2.mT).mT, mode="complete")
         E_mat, real = essential_in_span(torch.unflatten(Q[..., 5:].mT, -1, (3, 3)))
         pivots = R.diagonal(dim1=-2, dim2=-1).abs()
@@ -71,7 +71,7 @@ class Essential(Fundamental):
         return self.C2.mT @ E_mat @ self.C1
 
     def reweighted_fit(self, x1: Tensor, x2: Tensor, M: Tensor, losses: Sequence[Loss]) -> Fit | None:
-        """Return None: there is no fit but Levenberg-Marquardt."""
+        """Return None: essential matrices have no such fit, and are optimised on their manifold."""
         return None
 
 
@@ -94,7 +94,7 @@ class Calibrated(NamedTuple):
     def rotations(self) -> Tensor:
         """Return the two rotations (B, 2, 3, 3) of each essential matrix; translations are along view 2's last axis.
 
-        Without a decomposition, whose derivatives two equal singular values make infinite.
+        No SVD is computed: two equal singular values would make its derivatives infinite.
         """
         U, V = self.axes.unbind(1)
         turn = self.A.new_tensor([[0.0, 1.0], [-1.0, 0.0]]) @ self.A * 2**0.5

@@ -123,7 +123,7 @@ class Fundamental(TwoViewModel):
         return algebraic * scale, J.flatten(1, 2)
 
     def robust_distance(self, M: Tensor, x1: Tensor, x2: Tensor, present: Tensor | None) -> tuple[Tensor, Tensor]:
-        r"""Return squared Sampson distances and gradient factors, with a large share of the mean norm in each line."""
+        r"""Return squared Sampson distances and gradient factors, with 0.3 of the mean norm added to each line's."""
         norm1, norm2 = line_norms(x1, x2, M, present, floor=FEATURE_FLOOR)
         factor = 1 / (norm1.square() + norm2.square())
         return (x2 * (M @ x1)).sum(1).square() * factor, factor

@@ -1,4 +1,4 @@
-"""The contract of a two-view model: what differs between fundamental, essential matrices and homographies.
+"""The interface of a two-view model: what differs between fundamental matrices, essential ones and homographies.
 
 Layers, the optimiser and RANSAC are written once, against :class:`TwoViewModel`. A new model is one subclass and the
 :class:`State` on its manifold.
@@ -71,9 +71,9 @@ class TwoViewModel(Residuals):
     preferred: tuple[float, ...]  # the matrix, row by row, that is chosen where the correspondences leave a choice
 
     # How RANSAC searches
-    confidence = 0.999999  # of the search for a sample without outliers, which must not have much noise either
+    confidence = 0.999999  # that a sample without outliers is drawn; high, because a sample must have little noise too
     max_batch = 1024  # samples in a batch
-    pool_size = 12  # best hypotheses of a batch, which local optimisation fits, and of all, which the final fit does
+    pool_size = 12  # best hypotheses that are kept: of a batch for local optimisation, of all for the final fit
     prescored = 512  # correspondences on which the hypotheses of a batch are scored first, if there are twice as many
 
     # The linear problem
@@ -92,7 +92,7 @@ class TwoViewModel(Residuals):
 
     @abstractmethod
     def carry(self, M: Tensor, T1: Tensor, T2: Tensor) -> Tensor:
-        """Return the matrices of points from matrices of points after the transforms T1 and T2."""
+        """Return the matrices for the original points, from matrices for points transformed by T1 and T2."""
 
     @abstractmethod
     def swap(self, M: Tensor) -> Tensor:
@@ -117,7 +117,7 @@ class TwoViewModel(Residuals):
         return self.constrain(problem.null_matrix)
 
     def fallback(self, M: Tensor) -> Tensor:
-        """Return the matrices, or another one in place of those that are none of the model: of undetermined sets."""
+        """Return the matrices of undetermined sets, with a valid one in place of any that the model excludes."""
         return M
 
     # Residuals

@@ -11,7 +11,7 @@ from kornia_learnnorm.geometry.checks import check_pairs, check_tensor
 def check_numbers(
     inl_th: float, max_samples: int, max_seconds: float | None, confidence: float | None, seed: int | None
 ) -> None:
-    """Raise a clear error for numbers that are none, or out of their range."""
+    """Raise a clear error for arguments that are not numbers, or out of range."""
     for name, value in {"inl_th": inl_th, "confidence": confidence, "max_seconds": max_seconds}.items():
         if (isinstance(value, bool) or not isinstance(value, Real)) and (value is not None or name == "inl_th"):
             raise TypeError(f"{name} must be a number, got {value!r}")

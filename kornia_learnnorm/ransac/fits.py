@@ -16,17 +16,17 @@ from kornia_learnnorm.ransac.scoring import Hypotheses, PairScorer
 
 LOCAL_SCALES = (3.0, 2.0, 1.5, 1.0, 1.0)  # thresholds of the steps: a noisy sample has few inliers
 MANIFOLD_SCALES = (3.0, 1.5, 1.0, 1.0)  # thresholds of the steps on the manifold
-# Number of these steps and their relaxation: bounded losses make them too short, but the first one comes from afar.
+# Numbers of these steps and their relaxation: bounded losses make steps too short, except for the first, long one.
 MANIFOLD_STEPS = ((1, 1.0), (3, 1.3))
 TOLERANCE = 1e-3  # cosine of distances and derivatives at which a matrix has converged
 LOSS_SCALE = 0.7  # scale of the loss of the final fit, in thresholds
 STEPS = 3  # steps of least squares on that loss
-MIN_GAIN = 1e-3  # share of the cost that least squares may leave to gain; above, Levenberg-Marquardt goes on
+MIN_GAIN = 1e-3  # share of the cost that another step may gain; above, Levenberg-Marquardt follows
 MAX_LM_STEPS = 10  # steps of Levenberg-Marquardt
-LM_RELAXATION = 1.4  # of those on the manifold
-POSE_PIXELS = 2.0  # scale at which the pose of a matrix that left the cameras must still fit
-POOL_SIZE = 2  # best hypotheses, of which correspondences in front of both cameras choose one
-MIN_FRONT_GAIN = 1.1  # of another one over these: of the two poses of a plane, one has many behind a camera
+LM_RELAXATION = 1.4  # factor on these steps on the manifold
+POSE_PIXELS = 2.0  # pixels, scale at which the pose of a matrix without cameras must still fit
+POOL_SIZE = 2  # best hypotheses, among which the correspondences in front of both cameras decide
+MIN_FRONT_GAIN = 1.1  # by which another one must exceed these: the wrong pose of a plane has many behind a camera
 
 
 def optimize_locally(scorer: PairScorer, M: Tensor) -> Hypotheses:
@@ -58,7 +58,7 @@ def optimize_locally(scorer: PairScorer, M: Tensor) -> Hypotheses:
 
 
 def fit_final(scorer: PairScorer, pool: Hypotheses) -> Any:
-    """Return the state of the optimum on all correspondences that is next to the best of the pool."""
+    """Return the state of the local optimum over all correspondences, from the hypotheses of the pool."""
     model, threshold = scorer.model, scorer.threshold
     loss = GemanMcClure(LOSS_SCALE * threshold)
     fit = model.reweighted_fit(scorer.x1, scorer.x2, pool.F_mat, [Truncated(threshold), *STEPS * [loss]])
@@ -69,14 +69,14 @@ def fit_final(scorer: PairScorer, pool: Hypotheses) -> Any:
     if not float(fit.gain[best]) <= MIN_GAIN:
         optimum = minimize(scorer.cost(loss), state, MAX_LM_STEPS, TOLERANCE)[1]
         state, cost = optimum.state, float(optimum.cost[0])
-    # The loss is nowhere above that of MSAC: so much does an optimum cost at most, up to a margin for the scores.
+    # The loss never exceeds that of MSAC, which bounds the cost of an optimum, up to a margin for the scores.
     share = 1 - float(pool.score[0]) / scorer.terms.shape[-1]
     most = threshold**2 * (1.1 * share * scorer.x1.shape[-1] + model.sample_size)
     return state if cost <= most else model.state(pool.F_mat[:1])
 
 
 def _fit_on_manifold(scorer: PairScorer, M: Tensor, loss: Loss) -> Any:
-    """Return the state of the optimum of the model that is next to the best of matrices (K, 3, 3), best first.
+    """Return the state of the local optimum of the model, from the matrices (K, 3, 3), best first.
 
     Correspondences behind a camera are mismatches: they neither vote nor count in the fit. Where the correspondences
     contradict the cameras, the optimum is that of fundamental matrices, if its pose still fits.
@@ -93,7 +93,7 @@ def _fit_on_manifold(scorer: PairScorer, M: Tensor, loss: Loss) -> Any:
         best, other = int(votes[:POOL_SIZE].argmax()), int(votes.argmax())
         best = other if float(votes[other]) > MIN_FRONT_GAIN * float(votes[best]) else best
         if float(gains[best].sum()) <= MIN_FRONT_GAIN * float(votes[best]):
-            break  # no other one can have so many more
+            break  # no other hypothesis can exceed it by that factor
     state, weights = type(state)(*(value[best : best + 1] for value in state)), weights[best : best + 1]
     cost = scorer.cost(loss, weights=weights)._replace(relaxation=LM_RELAXATION)
     state = minimize(cost, state, MAX_LM_STEPS, TOLERANCE)[1].state

@@ -17,10 +17,10 @@ MIN_SAMPLE_SHIFT = 0.01  # thresholds; a sample that a shift of a point by less 
 def solve_minimal_samples(
     scorer: PairScorer, rows: Tensor, linear: TwoViewModel, normalizer: Normalizer | None
 ) -> Tensor:
-    """Return the matrices of the non-degenerate minimal samples (K, S), or of all their correspondences without any.
+    """Return the matrices of the non-degenerate minimal samples (K, S); if there are none, that of all their matches.
 
-    Matches on one line give none. Samples that a normaliser must see, and all correspondences together, are solved by
-    the DLT of the model ``linear``.
+    Matches on one line give no matrix. Samples for a normaliser, and all matches together, are solved by the DLT of the
+    model ``linear``.
     """
     model, shift = scorer.model, MIN_SAMPLE_SHIFT * scorer.threshold
     x1, x2 = (x[:, rows].movedim(0, -1) for x in (scorer.x1, scorer.x2))

@@ -29,8 +29,8 @@ from kornia_learnnorm.ransac.threads import one_thread
 
 FIRST_BATCH = 64  # samples in the first batch; each batch is four times as large as the one before
 MAX_SCORED = 4096  # correspondences that hypotheses are scored on, drawn once
-FEW_INLIERS = 0.25  # of the matches; below, the last tenth of the samples, or a batch, is drawn near the best matrix
-NEAR = 20.0  # thresholds; of the matches this near the best matrix, fewer are outliers than of all
+FEW_INLIERS = 0.25  # inlier ratio; below, the last samples, a tenth or at least a batch, are near the best matrix
+NEAR = 20.0  # thresholds; the matches this near the best matrix have a smaller share of outliers
 Cameras = tuple[Tensor, Tensor]
 
 
@@ -50,33 +50,33 @@ class RANSAC(nn.Module):
     r"""Estimate a fundamental matrix, an essential matrix or a homography from correspondences with outliers.
 
     Minimal samples of seven, or with a normaliser samples of eight for :func:`~kornia_learnnorm.find_fundamental`, are
-    solved in batches, and MSAC scores their matrices. In local optimisation, the best matrices of each batch are fitted
-    to their inliers by reweighted least squares, and the first also by the normaliser. The inlier ratio of the best
-    matrix so far decides how many samples are still needed. If it is low, or the samples run out, the last samples are
-    drawn near the best matrix. At the end the best matrices are fitted with the Geman-McClure loss, and the one of
-    least cost is refined by Levenberg-Marquardt if least squares have not converged.
+    solved in batches, and MSAC scores their matrices. Local optimisation fits the best matrices of each batch
+    to their inliers by reweighted least squares, and the best of them also by the DLT with the normaliser. The inlier
+    ratio of the best matrix so far decides how many samples are still needed. If it is low, or the samples run out, the
+    last samples are drawn from the matches near that matrix. In the final fit, the best matrices are fitted with the
+    Geman-McClure loss, and the one of least cost is refined by Levenberg-Marquardt if it has not converged.
 
     With both cameras, minimal samples of five run through Nister's five-point solver, and local optimisation and the
-    final fit are least squares on essential matrices; distances stay in pixels. The cameras are dropped, and the result
-    is a fundamental matrix, if that fits better than chance explains (with a probability below 0.001) and its pose
-    still fits with at most three times the standard error: the intrinsics are then inexact, or the lens or shutter is
-    not that of a pinhole camera. ``normalizer`` and ``rank2`` have no effect with cameras.
+    final fit are least squares on essential matrices; distances stay in pixels. If a fundamental matrix fits
+    significantly better (p < 0.001) and its pose still fits, with at most three times the standard error, this matrix
+    is the result: the intrinsics are then inexact, or the lens or shutter is not that of a pinhole camera.
+    ``normalizer`` and ``rank2`` have no effect with cameras.
 
-    Of matches that share a point exactly, in either view, only the one of highest weight counts, or the first among
-    equals: many matches on one point agree with every epipolar line through it.
+    Among matches that share a point exactly, in either view, only the one of highest weight counts (the first of equal
+    ones), because many matches on one point would agree with every epipolar line through it.
 
     On the CPU, PyTorch uses one thread during a call, see :func:`~kornia_learnnorm.ransac.threads.one_thread`.
 
-    :meth:`forward` has the arguments and results of that of ``kornia.geometry.RANSAC(model_type="fundamental_8pt")``;
-    the constructor's arguments differ, the matrix has unit Frobenius norm, and weights guide the sampling.
+    :meth:`forward` has the signature of ``kornia.geometry.RANSAC(model_type="fundamental_8pt")``; the constructor's
+    arguments differ, the matrix has unit Frobenius norm, and weights guide the sampling.
 
     Args:
         normalizer: maps ``(points1, points2, weights)`` to the transforms of both views, for samples of eight and for
             the refits of local optimisation. Leave it out to draw samples of seven, of which fewer are needed.
         inl_th: largest distance of an inlier, pixels.
         max_samples: largest number of minimal samples (Kornia's ``max_iter`` counts batches of 2,048).
-        max_seconds: time after which no further batch of samples (64 at first, up to 1,024) is drawn; with it the
-            result depends on the machine.
+        max_seconds: time after which no further batch of samples (64 at first, up to 1,024; 4,096 for a homography) is
+            drawn; with it the result depends on the machine.
         confidence: probability, in :math:`(0, 1]`, that a sample without outliers is drawn before sampling stops, if
             the best matrix so far has all inliers; 1 draws all ``max_samples`` samples. By default 0.999999, because a
             sample must have little noise, too; 0.9999 for a homography; and 0.999 with cameras, which reduce the effect
@@ -85,7 +85,7 @@ class RANSAC(nn.Module):
         rank2: how the singularity constraint is enforced on samples of eight: ``"projection"`` in the normaliser's
             coordinates (Hartley's when not given), the default with a ``normalizer``, or ``"optimal"`` correction.
             Matrices of samples of seven are singular.
-        refine: whether to optimise; otherwise the result is the matrix of highest score among the minimal samples.
+        refine: run local optimisation and the final fit; otherwise return the best matrix of the minimal samples.
         seed: makes every call on the same input and device give the same result; None draws from PyTorch's generator.
         model: ``"fundamental"``, ``"homography"``, or a model of your own, which replaces ``distance`` and ``rank2``. A
             homography has minimal samples of four, no cameras and no ``rank2``; its symmetric distance is the root of
@@ -95,7 +95,7 @@ class RANSAC(nn.Module):
         TypeError: if ``normalizer`` cannot be called, or ``inl_th``, ``confidence``, ``max_seconds`` or ``seed`` is not
             a number.
         ValueError: if a number is out of its range, ``max_samples`` is not whole, or ``model``, ``distance`` or
-            ``rank2`` is unknown.
+            ``rank2`` is an unknown name.
 
     Reference:
         P. Torr, A. Zisserman, MLESAC, CVIU 2000 (MSAC); O. Chum, J. Matas, J. Kittler, Locally optimized RANSAC, DAGM
@@ -211,11 +211,11 @@ class RANSAC(nn.Module):
         least = self.model.min_points if cameras is None else Essential.sample_size
         check_matches(points1, points2, weights, least)
         threads = one_thread() if points1.device.type == "cpu" else nullcontext()
-        # Inference mode is faster, but what a normaliser keeps of it would be of no use in training.
+        # Inference mode is faster, but a normaliser may cache tensors, which could not be used in training then.
         gradients = torch.inference_mode() if self.normalizer is None else torch.no_grad()
         with threads, without_autocast(points1), gradients:
             kept = torch.ones_like(points1[:, 0], dtype=torch.bool)
-            # Not "larger": one may be NaN.
+            # `not <=` is also true of NaN, unlike `>`.
             if not torch.maximum(points1.abs().max(), points2.abs().max()) <= MAX_MEDIAN_DISTANCES * self.inl_th:
                 kept = finite_and_bounded(points1, points2, self.inl_th)
             best = distinct_points(points1[kept], points2[kept], None if weights is None else weights[kept])
@@ -263,7 +263,7 @@ class RANSAC(nn.Module):
         return RansacResult(F_mat, inliers, drawn, score, E_mat)
 
     def _search(self, scorer: PairScorer, sampler: Sampler, generator: torch.Generator) -> tuple[Hypotheses, int]:
-        """Return the best hypotheses that enough minimal samples give, best first, and the number of samples."""
+        """Return the best hypotheses, best first, after drawing enough minimal samples, and how many were drawn."""
         pool, model = Hypotheses(scorer.x1.new_zeros(0, 3, 3), scorer.x1.new_zeros(0)), scorer.model
         most = self.max_samples - (self.max_samples // 10 if self.refine else 0)
         batch, drawn, needed, start, near_best = FIRST_BATCH, 0, most, time.perf_counter(), False
@@ -279,7 +279,7 @@ class RANSAC(nn.Module):
             found = scorer.best(scorer.shortlist(F_mat) if self.refine else F_mat, model.pool_size)
             pool = pool.join(found, model.pool_size)
             needed = needed if near_best else min(most, self._samples_needed(pool, scorer, sampler))
-            # The final fit optimises a pool that ends the search, but of essential matrices its best one alone.
+            # The final fit optimises the pool that ends the search; of essential matrices, only the best one.
             fitted_later = drawn >= needed and not isinstance(model, Essential)
             if self.refine and not fitted_later and len(found.F_mat):
                 pool = pool.join(self._optimize(scorer, found.F_mat), model.pool_size)
@@ -299,7 +299,7 @@ class RANSAC(nn.Module):
         return optimize_locally(scorer, M)
 
     def _samples_needed(self, pool: Hypotheses, scorer: PairScorer, sampler: Sampler) -> int:
-        """Return how many samples hold one without outliers with the confidence, if the best matrix is right."""
+        """Return how many samples contain an outlier-free one with the confidence, if the best matrix is right."""
         confidence = scorer.model.confidence if self.confidence is None else self.confidence
         if len(pool.F_mat) == 0 or confidence == 1:
             return self.max_samples

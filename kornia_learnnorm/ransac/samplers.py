@@ -11,8 +11,8 @@ MIN_WEIGHT = 1e-30  # smallest positive weight, relative to the largest
 def draw_distinct(totals: Tensor, size: int, generator: torch.Generator) -> Tensor:
     r"""Draw sets of distinct indices, each set uniformly from its own range.
 
-    Floyd's algorithm, a column at a time: the :math:`k`-th draws from the first :math:`n - s + k + 1` indices and,
-    where it meets one that is there, takes the last of these instead.
+    Floyd's algorithm, a column at a time: column :math:`k` draws from the first :math:`n - s + k + 1` indices and
+    replaces an index that is already drawn by the last of these.
 
     Reference:
         J. Bentley, R. Floyd, Programming pearls: a sample of brilliance, CACM 1987.
@@ -26,14 +26,14 @@ def draw_distinct(totals: Tensor, size: int, generator: torch.Generator) -> Tens
 
 
 class UniformSampler:
-    """Uniform samples of so many correspondences; those of both samplers are indices, (count, size) int64."""
+    """Uniform samples of ``size`` correspondences. Both samplers return indices, (count, size) int64."""
 
     def __init__(self, total: int, device: torch.device, size: int = SAMPLE_SIZE) -> None:
         self.total, self.device, self.size = total, device, size
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Return the indices of the next samples."""
-        # Of many correspondences, those that are drawn one by one are nearly always distinct.
+        # Among many correspondences, independent draws are nearly always distinct.
         spare = count // 4 + self.size
         drawn = torch.randint(self.total, (count + spare, self.size), generator=generator, device=self.device)
         ordered = drawn.sort(-1).values
@@ -55,8 +55,8 @@ class UniformSampler:
 class WeightedSampler:
     """Samples with probability in proportion to the squares of weights, without replacement.
 
-    The square draws the best correspondences more often where most are outliers, and still all of them where few are.
-    Weights (N,) are non-negative, at least as many of them positive as a sample holds; weight zero is never drawn.
+    The square favours the best correspondences where most are outliers, and still draws all where few are. Weights (N,)
+    are non-negative, and at least ``size`` of them positive; a correspondence of weight zero is never drawn.
 
     Reference:
         P. Efraimidis, P. Spirakis, Weighted random sampling with a reservoir, Information Processing Letters 2006.
@@ -70,7 +70,7 @@ class WeightedSampler:
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Return the indices of the next samples."""
-        # The first that differ among twice as many independent draws are drawn without replacement.
+        # The first distinct indices among twice as many independent draws are a sample without replacement.
         uniform = torch.rand(count, 2 * self.size, generator=generator, device=self.upto.device, dtype=self.upto.dtype)
         drawn = torch.searchsorted(self.upto, uniform * self.upto[-1], right=True)
         repeats = (drawn[:, :, None] == drawn[:, None]).tril(-1).any(-1)

@@ -25,7 +25,7 @@ class Hypotheses(NamedTuple):
     score: Tensor  # MSAC scores, positive, (K,)
 
     def join(self, other: Self, number: int) -> Self:
-        """Return the best of both, at most so many; ``other`` comes first in ties."""
+        """Return the best of both, at most ``number``; ``other`` comes first in ties."""
         both = type(self)(*(torch.cat([theirs, ours]) for ours, theirs in zip(self, other, strict=True)))
         order = both.score.argsort(descending=True, stable=True)[:number]
         return type(self)(*(values[order] for values in both))
@@ -34,16 +34,16 @@ class Hypotheses(NamedTuple):
 class PairScorer:
     r"""MSAC scores on one pair's correspondences, :math:`\sum_i \max(0, 1 - d_i^2 / \tau^2)`.
 
-    Matrix products of what the model says of the correspondences give the distances of all correspondences under all
-    matrices, in float32.
+    The distances of all correspondences under all matrices are matrix products of the matrices and the model's terms of
+    the correspondences, in float32.
 
     All matrices are in coordinates of which the first two are pixels from the points' median, and the third is the
     median of their absolute values, or the threshold where that is larger. They are conditioned like Hartley's,
     whatever the outliers, and distances in them are those in pixels: ``x1``, ``x2`` are all correspondences in them,
     (3, N), ``T1``, ``T2`` the transforms from pixels, (3, 3).
 
-    Points are pixels (N, 2), :func:`finite_and_bounded`. ``rows`` are the correspondences that count in scores, those
-    that count in :meth:`shortlist` first; all by default.
+    Points are pixels (N, 2), :func:`finite_and_bounded`. ``rows`` are the correspondences that are scored, all by
+    default; :meth:`shortlist` scores on the first of them.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class PairScorer:
         self.terms = model.score_terms(self.x1[:, rows], self.x2[:, rows]).float()
 
     def of_cameras(self, K1: Tensor, K2: Tensor) -> Self:
-        """Return the scorer of the same correspondences whose model are essential matrices of cameras (3, 3)."""
+        """Return a scorer of these correspondences for essential matrices of cameras (3, 3)."""
         other = copy.copy(self)
         K1, K2 = (K.to(self.x1)[None] for K in (K1, K2))
         other.model = Essential.of_cameras(K1, K2, self.T1, self.T2, getattr(self.model, "distance", "sampson"))
@@ -80,7 +80,7 @@ class PairScorer:
         return self.model.carry(F_mat, self.T1, self.T2)
 
     def best(self, F_mat: Tensor, number: int) -> Hypotheses:
-        r"""Return the matrices of highest score, at most so many, of those with an inlier."""
+        r"""Return the at most ``number`` matrices of highest score that have an inlier."""
         scores = self._scores(F_mat, self.terms)
         score, order = scores.topk(min(number, len(scores)))
         positive = int((score > 0).sum())

@@ -1,4 +1,4 @@
-"""RANSAC made soft, for training: hypotheses from random minimal samples, scored smoothly, chosen by a softmax."""
+"""Differentiable RANSAC for training: random minimal samples, soft inlier counts, and a choice by softmax."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -16,8 +16,8 @@ from kornia_learnnorm.normalizers.normalizer import Normalizer
 def sample_minimal_sets(logits: Tensor, count: int, generator: Generator | None = None) -> tuple[Tensor, Tensor]:
     r"""Draw minimal samples of eight correspondences, without replacement within a sample.
 
-    One after the other, correspondence :math:`i` is drawn with probability :math:`\propto e^{l_i}` of those that are
-    left. So the probability of a sample in its order is, with :math:`p = \mathrm{softmax}(l)`,
+    One after the other, correspondence :math:`i` is drawn with probability :math:`\propto e^{l_i}` among those that are
+    left. So the probability of an ordered sample is, with :math:`p = \mathrm{softmax}(l)`,
 
     .. math:: P(i_1, \dots, i_8) = \prod_{j=1}^{8} \frac{p_{i_j}}{1 - \sum_{k < j} p_{i_k}} .
 
@@ -79,7 +79,7 @@ def expected_loss(
     slope: float = 5.0,
     scale: float = 0.1,
 ) -> SoftChoice:
-    r"""Return the loss that is expected of a hypothesis chosen at random by its soft inlier count.
+    r"""Return the expected loss of a hypothesis drawn with the softmax probabilities of soft inlier counts.
 
     With :math:`F_k` from the eight correspondences of sample :math:`k` and Sampson distances :math:`d_{ki}`,
 
@@ -89,7 +89,7 @@ def expected_loss(
     Gradients reach the points and the normaliser through :math:`\ell` and through :math:`s`. With ``log_probs`` they
     reach the sampling as well, by the score function (REINFORCE): the gradient of the loss gets the term
     :math:`\sum_k (L - L_{-k}) \nabla \log P_k`, in which the baseline :math:`L_{-k}`, the expected loss without sample
-    :math:`k`, takes away variance and adds no bias.
+    :math:`k`, reduces the variance and adds no bias.
 
     Args:
         points1: pixels in the first image with shape :math:`(B, N, 2)`, :math:`N \ge 8`, float32 or float64.
