@@ -1,4 +1,4 @@
-"""Training losses: of samples, of matches with outliers and without labels, and with ground truth."""
+"""Training losses: self-supervised on samples, without labels on matches with outliers, and with ground truth."""
 
 from collections.abc import Callable
 
@@ -18,8 +18,8 @@ class EpipolarLoss(nn.Module):
     r"""Residuals on the sample's own points and on held-out points: the self-supervised loss of Fan et al.
 
     With ``log=False``, the mean residual of a sample is averaged over the batch (Fan et al., Eq. 8). With ``log=True``,
-    the logarithm of this mean is averaged, so that a few bad samples do not dominate. The logarithm of held-out
-    residuals is taken of each correspondence.
+    the logarithm of this mean is averaged, so that a few bad samples do not dominate. For held-out residuals,
+    the logarithm of each correspondence is averaged.
 
     Args:
         residual: maps ``(points1, points2, F_mat)`` to residuals :math:`(B, N)`, such as
@@ -27,7 +27,7 @@ class EpipolarLoss(nn.Module):
         log: average the logarithm instead of the residual.
         heldout_weight: share of the held-out residuals in the loss, 0 to 1.
         floor: added to the residuals under the logarithm, in their unit.
-        heldout_floor: the same for held-out residuals, which do not fit far below a pixel.
+        heldout_floor: floor of the held-out residuals, which rarely are far below a pixel.
         ceiling: residuals above this, also infinite ones, are clamped to it and send no gradient.
 
     ValueError if ``heldout_weight`` is outside 0 to 1, or a floor or the ceiling is not positive.
@@ -120,7 +120,7 @@ class LogEpipolarLoss(nn.Module):
     r"""Mean of :math:`\log(d + f)` over true inliers, with the symmetric epipolar distance :math:`d`.
 
     Args:
-        floor: distance :math:`f` in pixels, far below which nothing is gained; ValueError unless positive.
+        floor: distance :math:`f` in pixels; errors far below it hardly count. ValueError unless positive.
         residual: another distance, such as :func:`~kornia_learnnorm.transfer_distance` of homographies.
 
     Example:
@@ -147,7 +147,7 @@ class LogEssentialLoss(nn.Module):
     radians between the translations, or 0.7 to 1 times the angle between the rotations.
 
     Args:
-        floor: distance :math:`f`, far below which nothing is gained; ValueError unless positive.
+        floor: distance :math:`f`; errors far below it hardly count. ValueError unless positive.
 
     Example:
         >>> E_mat = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]])
@@ -164,7 +164,7 @@ class LogEssentialLoss(nn.Module):
     def forward(self, E_mat: Tensor, true: Tensor) -> Tensor:
         """Return the loss of each set, (B,), of essential matrices and the true ones, (B, 3, 3), of any scale."""
         E_mat, true = (M / torch.linalg.matrix_norm(M, keepdim=True) for M in (E_mat, true.to(E_mat)))
-        # In place of the root of a sum of squares, which has no derivative at zero.
+        # Squares, because a norm has no derivative at zero.
         squares = torch.stack([E_mat - true, E_mat + true]).square().sum((-1, -2)).amin(0)
         return ((squares + self.floor**2).sqrt()).log()
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from kornia_learnnorm.geometry.checks import check_tensor, safe_divisor, weighted_mean, without_autocast
 
-EPIPOLE_TOLERANCE = 1e-12  # length of an epipolar line's normal over that of its summands; rounding leaves less
+EPIPOLE_TOLERANCE = 1e-12  # length of an epipolar line's normal over that of its summands; less is rounding
 
 
 def _check(points1: Tensor, points2: Tensor, M: Tensor, name: str = "F_mat") -> None:
@@ -141,7 +141,7 @@ def transfer_distance(points1: Tensor, points2: Tensor, H_mat: Tensor) -> Tensor
     with without_autocast(points1):
         distance: Tensor = symmetric_transfer_error(points1, points2, H_mat, squared=False)
     unknown = (points1 + points2).isnan().any(-1) | H_mat.isnan().flatten(-2).any(-1, keepdim=True)
-    distance = distance.masked_fill(unknown, torch.nan)  # which Kornia takes for the distance under a singular matrix
+    distance = distance.masked_fill(unknown, torch.nan)  # Kornia replaces NaN by the distance under a singular matrix
     return distance[0] if single else distance
 
 

@@ -91,7 +91,7 @@ def in_front(R: Tensor, t: Tensor, K1: Tensor, K2: Tensor, points1: Tensor, poin
     """Return which correspondences poses put in front of both cameras, (B, S, N) bool; false where a pose is NaN.
 
     Poses :math:`X_2 = R X_1 + t` are (B, S, 3, 3) and (B, S, 3) of any length, points pixels (B, N, 2). The depths are
-    those of z2 x2 = z1 R x1 + t: crossed with one ray, it leaves the other's depth.
+    those of z2 x2 = z1 R x1 + t: the cross product with one ray leaves the other's depth.
     """
     views = (K1, points1), (K2, points2)
     rays1, rays2 = (torch.linalg.solve(K, convert_points_to_homogeneous(points).mT).mT[:, None] for K, points in views)

@@ -45,7 +45,7 @@ def optimal_rank2(F_mat: Tensor, points1: Tensor, points2: Tensor, weights: Tens
 
     Returns:
         fundamental matrices with shape :math:`(B, 3, 3)` in the dtype of the points, of rank 2 and unit Frobenius norm.
-        Where the correspondences do not determine :math:`F`, its free directions meet the constraint, and
+        Where the correspondences do not determine :math:`F`, the correction is along its free directions, and
         :math:`V_0` carries no gradient.
 
     Raises:

@@ -107,8 +107,8 @@ class LearnedNormalizer(ProblemNormalizer):
         """Write weights and architecture to one ``.safetensors`` file, whole or not at all.
 
         Raises:
-            TypeError: if the base, the network or the builder cannot be imported by its name, or its constructor does
-                not keep its arguments, numbers and texts, as attributes: the file could not say how to build it.
+            TypeError: if the base, the network or the builder cannot be imported by name, or its constructor arguments
+                are not all numbers or strings that it keeps as attributes: the file could not describe it.
             ValueError: if ``path`` does not end in ``.safetensors``.
             OSError: if it cannot be written.
         """

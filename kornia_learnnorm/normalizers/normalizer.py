@@ -92,8 +92,8 @@ def transforms_of(normalizer: Normalizer, problem: LinearProblem) -> tuple[Tenso
 def normalizing_transforms(normalizer: Normalizer, problem: LinearProblem) -> tuple[Tensor, Tensor]:
     """Return the transforms of a normaliser, which may be the user's own, in the dtype of the problem.
 
-    Anything but two finite and invertible transforms :math:`(B, 3, 3)` is a ValueError, and what cannot be called a
-    TypeError.
+    It is a ValueError if it does not return two finite and invertible transforms :math:`(B, 3, 3)`, and a TypeError if
+    it cannot be called.
     """
     result = transforms_of(normalizer, problem)
     expected = (problem.points1.shape[0], 3, 3)

@@ -1,9 +1,9 @@
-r"""Whitening reweighted by the epipolar geometry: the closed-form way to a good rank-2 projection.
+r"""Whitening reweighted by the epipolar geometry, which improves the rank-2 projection in closed form.
 
-Projected to rank 2, the null vector of eight points loses :math:`\sigma\, a b^\top`, which leaves correspondence
-:math:`i` the residual :math:`\sigma\, (a^\top x_{2,i}) (b^\top x_{1,i})`. The normalisation chooses the lines :math:`a`
-and :math:`b`, and nothing else. Given one, the best other one is weighted least squares; both hold together where they
-are singular vectors in whitened coordinates. So alternating least squares is iterated whitening.
+The projection to rank 2 subtracts :math:`\sigma\, a b^\top` from the null vector of eight points, which leaves
+correspondence :math:`i` the residual :math:`\sigma\, (a^\top x_{2,i}) (b^\top x_{1,i})`. The normalisation only affects
+the lines :math:`a` and :math:`b`. For a given line, the best other one is a weighted least-squares solution. Both are
+optimal where they are singular vectors in whitened coordinates, so alternating least squares is iterated whitening.
 """
 
 import torch
@@ -28,7 +28,7 @@ NORMAL_FLOOR = 1e-3  # share of the mean norm of the lines' normals, added to ea
 class ReweightedWhitening(ProblemNormalizer):
     r"""Whitening with weights that make the rank-2 projection minimise the symmetric epipolar distance.
 
-    Starts from the DLT's null vector :math:`F_0` and the weights
+    It starts from the DLT's null vector :math:`F_0` and the weights
     :math:`w_i = 1 / \|(F_0^\top x_{2,i})_{1:2}\| + 1 / \|(F_0 x_{1,i})_{1:2}\|`, the factor from an algebraic residual
     to the symmetric epipolar distance (Fan et al., Eq. 8). Each iteration finds the lines :math:`a, b` of the rank-2
     correction, :math:`b \propto S_1^{-1} F_0^{-1} a` and :math:`a \propto S_2^{-1} F_0^{-\top} b`, and sets the weights
@@ -37,7 +37,7 @@ class ReweightedWhitening(ProblemNormalizer):
     swaps the transforms.
 
     Args:
-        iterations: number of reweightings; 0 whitens with :math:`w`. ValueError for a negative number.
+        iterations: number of reweightings; 0 whitens with the initial :math:`w`. ValueError for a negative number.
         damping: share of the mean residual added to each residual before it divides; ValueError unless positive.
 
     Example:
@@ -57,10 +57,10 @@ class ReweightedWhitening(ProblemNormalizer):
 
     def transforms(self, problem: LinearProblem) -> tuple[Tensor, Tensor]:
         """Return the transforms :math:`(B, 3, 3)` of both views."""
-        # Where rounding decides on the null vector, it decides on the weights too, and every iteration multiplies their
-        # derivatives by another inverse of a vanishing number.
+        # Where rounding decides the null vector, it decides the weights too, and every iteration would divide their
+        # derivatives by another vanishing number.
         held = problem.detach(~problem.determined) if needs_gradient(problem.x1, problem.x2) else problem
-        # Hartley's coordinates keep the shape of the pixels, which the distances to lines need.
+        # Hartley's transform is a similarity, so distances to lines are those in pixels up to scale.
         # The batch comes last, (2, N, 2, B) for coordinates and views: every operation runs along contiguous memory.
         points = torch.stack([held.x1, held.x2])[..., :2].permute(3, 2, 0, 1).contiguous()
         T1, T2 = _whitening(points, self._weigh(points, held)) @ torch.stack([problem.T1, problem.T2])
@@ -74,7 +74,7 @@ class ReweightedWhitening(ProblemNormalizer):
         """Return the weights of the last whitening of both views, ``(N, 2, B)``, for their points ``(2, N, 2, B)``."""
         F0 = problem.null_matrix
         weights = None if problem.weights is None else problem.weights.mT[:, None]
-        # Weights of mean values: they sum to one.
+        # Weights that sum to one, for means.
         share = None if weights is None else weights / safe_divisor(weights.sum(0))
         both = torch.stack([F0, F0.mT]).permute(2, 3, 0, 1).contiguous()
         normals = _evaluate(both[:, :2], points.flip(-2))  # of the epipolar lines in both views, (2, N, 2, B)
@@ -83,7 +83,7 @@ class ReweightedWhitening(ProblemNormalizer):
             w = w * weights
         if self.iterations == 0:
             return w
-        # Adjugates stand for inverses: a line has no scale, and they exist where inverses do not.
+        # Adjugates replace inverses: lines are defined up to scale, and adjugates exist where inverses do not.
         inverse = cofactors(F0).mT
         inverses = torch.stack([inverse, inverse.mT]).permute(2, 3, 0, 1).contiguous()
         determinant = (inverse[..., 0, :] * F0[..., :, 0]).sum(-1)
@@ -139,7 +139,7 @@ def _best_line(products: Tensor, w: Tensor, target: Tensor, minors: Tensor, entr
     p, q, r, s = torch.unflatten(moments.index_select(0, minors), 0, (4, 6)).unbind(0)
     inverse = torch.addcmul(p * q, r, s, value=-1).index_select(0, entries)
     line = (torch.unflatten(inverse, 0, (3, 3)) * target).sum(1)
-    # Not `normalize`, whose floor leaves short lines short: from singular moments, shorter with every iteration.
+    # Not `normalize`, which clamps tiny norms: lines of singular moments would get shorter with every iteration.
     return line / safe_divisor(line.square().sum(0)).sqrt()
 
 

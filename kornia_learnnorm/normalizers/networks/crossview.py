@@ -70,7 +70,7 @@ class CrossViewNetwork(nn.Module):
             points1: points of the first view in base coordinates with shape :math:`(B, N, 2)`, :math:`N >= 8`.
             points2: points of the second view.
             weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
-            null_matrix: the DLT's unit null vectors there with shape :math:`(B, 3, 3)`; solved for when not given.
+            null_matrix: the DLT's unit null vectors in base coordinates, :math:`(B, 3, 3)`; computed when not given.
         """
         dtype = self.set_network.point_stem.weight.dtype
         points, sets = (part.to(dtype) for part in self._views(points1, points2, weights, null_matrix))
@@ -95,7 +95,7 @@ class CrossViewNetwork(nn.Module):
         entries = null_matrix.detach().flatten(-2)
         F = null_matrix * entries.gather(-1, entries.abs().argmax(-1, keepdim=True)).sign()[..., None]
         v, C = smallest_right_singular_vector(F)
-        u = normalize((C @ v[..., None])[..., 0], dim=-1)  # of the smallest singular value too
+        u = normalize((C @ v[..., None])[..., 0], dim=-1)  # left singular vector of the smallest singular value
         own, other, doubled = torch.stack([x1, x2]), torch.stack([x2, x1]), torch.stack([F, F.mT])
         points, sets = _epipolar_features(own, other, doubled, torch.stack([v, u]), torch.stack([u, v]), weights)
         return points.flatten(0, 1), sets.flatten(0, 1)
@@ -142,7 +142,7 @@ class SetNetwork(nn.Module):
 
         Optional weights :math:`(B, N)` are not negative; zero means absent.
         """
-        # Without gradients, in parts that stay in the processor's cache.
+        # Without gradients, evaluate in parts that stay in the processor's cache.
         part = max(1, MAX_POINTS // points.shape[1])
         if torch.is_grad_enabled() or torch.compiler.is_compiling() or points.shape[0] <= part:
             return self._evaluate(points, set_features, weights)

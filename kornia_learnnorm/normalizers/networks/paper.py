@@ -18,7 +18,7 @@ class PaperNetwork(nn.Module):
     the points before the first block and after each, a convolution over the stack of these maxima, and two fully
     connected layers. Both views share all weights. It takes two or more points, in any order.
 
-    Where the text leaves a choice: the first layer has no activation; a block is twice a linear layer, instance
+    Where the paper leaves a choice: the first layer has no activation; a block is twice a linear layer, instance
     normalisation and ReLU, plus the skip; no normalisation has parameters of its own; each maximum is normalised over
     its channels; the convolution is not padded; the last layer starts at zero, so an untrained network gives the
     transforms of the base.
@@ -71,7 +71,7 @@ class PaperNetwork(nn.Module):
         """Return the normalised maxima over the points before the first block and after each, :math:`(B, D + 1, C)`."""
         w = None if weights is None else weights.T[..., None]
         absent = None if w is None else w <= 0
-        # Points come first: statistics over them are then sums of whole rows, which is what a processor likes.
+        # Points come first: statistics over them are then sums of whole rows, which are fast on a CPU.
         h = self.stem(points.transpose(0, 1))
         maxima = [set_maximum(h, absent, 0)]
         for block in self.blocks:
