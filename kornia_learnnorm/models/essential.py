@@ -63,7 +63,7 @@ class Essential(Fundamental):
         return state._replace(C1=self.C1.expand_as(state.C1), C2=self.C2.expand_as(state.C2))
 
     def solve_samples(self, x1: Tensor, x2: Tensor, shift: float) -> Tensor:
-        """Return the matrices of samples of five, up to ten each, and none of degenerate ones; planes aren't degenerate."""
+        """Return the matrices of samples of five, up to ten each; degenerate ones have none, but coplanar ones have."""
         Q, R = torch.linalg.qr(design_matrix(x1 @ self.C1.mT, x2 @ self.C2.mT).mT, mode="complete")
         E_mat, real = essential_in_span(torch.unflatten(Q[..., 5:].mT, -1, (3, 3)))
         pivots = R.diagonal(dim1=-2, dim2=-1).abs()

@@ -1,4 +1,4 @@
-"""How far matches contradict the cameras that they are said to be of."""
+"""Measure how far matches contradict their given cameras: inexact intrinsics, or a lens distortion."""
 
 import math
 from typing import Any, NamedTuple
@@ -18,11 +18,11 @@ from kornia_learnnorm.ransac.fits import LOSS_SCALE
 from kornia_learnnorm.two_view.input_checks import Cameras
 from kornia_learnnorm.two_view.predicted_error import MEDIAN_SQUARE, MIN_NOISE
 
-NEAR_BENT, MAX_BENT = 3.0, 1000  # thresholds, and number; matches this near a matrix tell of a distortion
-# Shares by which undistortion moves the outermost point that are tried, and around the best of them: from strong
-# pincushion distortion to that of a wide angle.
+NEAR_BENT, MAX_BENT = 3.0, 1000  # thresholds, and number, of the matches to which a distortion is fitted
+# Grids of distortions, from strong pincushion to wide-angle lenses, and around the best: shares of its radius by which
+# undistortion moves the outermost point.
 BENDS, FINER = torch.arange(-1, 7, dtype=torch.float64) / 10, torch.arange(-3, 4, dtype=torch.float64) / 40
-PINHOLE = 1  # of BENDS, none
+PINHOLE = 1  # index of no distortion in BENDS
 
 
 class Misfit(NamedTuple):
@@ -43,8 +43,8 @@ class _Fit(NamedTuple):
 def camera_misfit(points1: Tensor, points2: Tensor, F_mat: Tensor, threshold: float, cameras: Cameras) -> Misfit:
     """Return what cameras cost matches (N, 2), compared with none.
 
-    Compared are the essential matrix next to F_mat (3, 3) and the fundamental matrix next to it. Only matches that
-    agree with the cameras count.
+    It compares the essential matrix refined from F_mat (3, 3) with the fundamental matrix refined from that. Only
+    matches that agree with the cameras count.
     """
     x1, x2, loss = points1[None], points2[None], GemanMcClure(LOSS_SCALE * threshold)
     E_mat = (cameras[1].mT @ F_mat @ cameras[0])[None]
@@ -64,8 +64,8 @@ def lens_misfit(
     r"""Return what pinhole cameras cost matches (N, 2), compared with a radial distortion, and its k1 in OpenCV.
 
     A point at the radius :math:`r` from the principal point, in focal lengths, is that of a pinhole camera at
-    :math:`r (1 + k r^2)`. Of some :math:`k`, the same for both views, that of the least cost counts, unless it is the
-    largest or the smallest.
+    :math:`r (1 + k r^2)`. One :math:`k` for both views is searched on a grid; if the best is the largest or the
+    smallest, the misfit is zero.
     """
     near = (sampson_distance(points1[None], points2[None], F_mat[None])[0] < NEAR_BENT * threshold).nonzero()[:, 0]
     near = near[:: 1 + len(near) // MAX_BENT]
@@ -93,7 +93,7 @@ def lens_misfit(
     best = min(range(len(bends)), key=lambda row: fine[row].cost)
     # A point that undistortion moves from r to r (1 + b) goes back by the factor 1 + k1 r^2 (1 + b)^2.
     bend, tied = float(bends[best]), coarse[PINHOLE]
-    if not BENDS[0] < bend < BENDS[-1]:  # what no lens explains better
+    if not BENDS[0] < bend < BENDS[-1]:  # at an end of the grid: no distortion
         return Misfit(0.0, 0.0, 0.0), 0.0
     misfit = _compare(tied, fine[best], freedom, threshold, cameras)
     misfit = misfit._replace(angle=_pose_angle(tied._replace(F_mat=F_mat[None]), fine[best], cameras))

@@ -38,11 +38,11 @@ from kornia_learnnorm.two_view.solver import MIN_SCORE
 
 CORNER = 0.5  # pixels from the corner of the first pixel to its centre
 THRESHOLD = 2.0  # pixels, of RANSAC
-INLIER_FACTOR = 2.0  # thresholds within which a match is an inlier: a few coarse ones are better than broken tracks
+INLIER_FACTOR = 2.0  # thresholds within which a match is an inlier: imprecise inliers are better than broken tracks
 MIN_INLIERS = 15  # of a verified pair, COLMAP's own number
 PLANAR_SHARE = 0.8  # of the inliers on one homography, COLMAP's own number
 MAX_SKEW = 1e-6  # of the focal length, by rounding
-PLANE_SAMPLES = 512  # are far more than it takes to find one of so many
+PLANE_SAMPLES = 512  # far more than needed to find a plane with that share of the inliers
 Array = NDArray[np.float64]
 
 
@@ -99,8 +99,8 @@ def export_colmap(
         K: camera (3, 3) of all images, pixels, without distortion. When not given, COLMAP derives cameras from EXIF, or
             from 1.2 times the longer side.
         single_camera: whether all images share one camera; with ``K`` they do.
-        layer: estimates the fundamental matrix in the place of RANSAC.
-        threshold: RANSAC's largest symmetric epipolar distance, pixels; inliers are the matches within twice of it.
+        layer: estimates the fundamental matrix instead of RANSAC.
+        threshold: RANSAC's largest symmetric epipolar distance, pixels; inliers are the matches within twice this.
         seed: seed of RANSAC.
         turned: whether the points are those of images rotated by EXIF, as a store has them, or of the stored files,
             as hloc and COLMAP read them.

@@ -42,13 +42,13 @@ from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.two_view.solver import MIN_MATCHES, Solution, TwoViewSolver
 
 MIN_MOTION = 0.1  # pixels, median over the matches; below, the camera has not moved
-MIN_EXTENT = 2.0  # pixels; images are larger
-MIN_RIVAL_SHARE = 0.6  # of the inliers; number of outliers that must agree on a second matrix for a warning
+MIN_EXTENT = 2.0  # pixels; points that stay below it must be normalised coordinates
+MIN_RIVAL_SHARE = 0.6  # outliers that must agree on a second matrix for a warning, over the number of inliers
 MIN_RIVAL_ANGLE = 15.0  # degrees between the poses of both matrices for a warning
-MIN_DEVIATIONS = 3.0  # by which matches off a plane must prefer one of its poses, or a warning tells of the other
+MIN_DEVIATIONS = 3.0  # standard deviations by which matches off a plane must prefer a pose, or there is a warning
 MIN_FREE_GAIN = 1.25  # inliers without cameras over inliers with them for a warning of wrong cameras
 MIN_FREE_SHARE = 0.25  # of the matches; inliers without cameras for this warning, as false matches agree on some matrix
-# Fields of PairEstimate, those of a pose only where there is one; standard errors; reasons for doubt.
+# Fields of PairEstimate (with those of a pose where there is one), standard errors, and warnings.
 Answer = tuple[dict[str, Any], predicted_error.PredictedError, tuple[PairWarning, ...]]
 
 
@@ -88,8 +88,8 @@ def estimate_matches(
         model: ``"auto"``, ``"fundamental"`` or ``"homography"``.
 
     Returns:
-        the estimate. Its matches are the given ones at the indices ``rows``: without those left out, those that share a
-        point with one of a higher score, and those that do not move at all, as on an overlay.
+        the estimate. Its matches are the given ones at the indices ``rows``: left out are, besides the rows above,
+        matches that share a point with one of a higher score, and those that do not move at all, as on an overlay.
 
     Raises:
         NoReliableMatrixError: if there are fewer than nine matches or inliers, or no motion.
@@ -158,7 +158,7 @@ def _usable_rows(points1: Tensor, points2: Tensor, scores: Tensor, threshold: fl
     if len(kept) >= MIN_MATCHES and median(motion).item() < MIN_MOTION:
         text = f"no motion between the images (median displacement {median(motion):.2g} px of {len(kept)} matches)"
         raise NoReliableMatrixError("no_motion", f"{text}: the fundamental matrix is not determined")
-    kept = kept[motion >= MIN_MOTION]  # what stands still lies on an overlay or a dirty lens
+    kept = kept[motion >= MIN_MOTION]  # matches that do not move lie on an overlay or a dirty lens
     if len(kept) < MIN_MATCHES:
         text = f"{len(kept)} distinct matches of {given} are left, at least {MIN_MATCHES} are needed"
         raise NoReliableMatrixError("few_matches", text)

@@ -25,7 +25,7 @@ from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 MAX_SIZE = 2000  # pixels of the longer side at which images are matched: SIFT then takes up to 0.5 GB and seconds
 MIN_SIZE = 64  # pixels of the longer side; smaller ones have too few features
 NUM_FEATURES = 4000  # of an image
-MIN_MUTUAL_SHARE = 0.85  # of the matches off the plane that fit; below, false ones may agree with each other
+MIN_MUTUAL_SHARE = 0.85  # of the matches off the plane that fit; below, false matches may agree with each other
 
 Image = str | Path | NDArray[np.uint8] | Tensor
 Mask = NDArray[np.bool_] | Tensor
@@ -53,7 +53,7 @@ def estimate_pair(
     Matches are mutual nearest neighbours that pass the ratio test in both directions, with 1 minus the larger ratio as
     score, or LightGlue's with its scores; :func:`~kornia_learnnorm.estimate_matches` estimates the matrix. Features on
     a constant black frame around an image are dropped. Where texture repeats, matches that do not move like their
-    neighbours are left out, and the predicted error is too small.
+    neighbours are left out; the predicted error is then too small.
 
     Args:
         image1: file of image 1, or its values: grey with shape (H, W) or RGB with shape (H, W, 3), uint8.
@@ -74,8 +74,8 @@ def estimate_pair(
         refiner: moves the matches to sub-pixel accuracy before the matrix is estimated.
 
     Raises:
-        NoReliableMatrixError, TypeError, ValueError: as :func:`~kornia_learnnorm.estimate_matches`; the first one too
-            for a blank image, a ValueError for a file that is not an image.
+        NoReliableMatrixError, TypeError, ValueError: as :func:`~kornia_learnnorm.estimate_matches`, and a
+            NoReliableMatrixError for a blank image, a ValueError for a file that is not an image.
         FileNotFoundError: if a file does not exist.
         ImportError: if OpenCV is not installed.
     """
@@ -87,7 +87,7 @@ def estimate_pair(
 
 @dataclass(frozen=True, eq=False)
 class MatchedPair:
-    """The matches of two images, to be estimated by any method; nearest neighbours pass the ratio test from image 1."""
+    """The matches of two images, for any estimator; nearest neighbours pass the ratio test at least from image 1."""
 
     points1: Tensor  # pixels of image 1 as it was matched, (N, 2), float64
     points2: Tensor  # pixels of image 2 as it was matched, (N, 2), float64
@@ -194,7 +194,7 @@ def match_two_images(
 
 
 def check_matching(ratio: float, max_size: int, detector: str, matcher: str) -> None:
-    """Raise a clear error for options of matching that are of a wrong type, out of range or do not go together."""
+    """Raise a clear error for matching options that are of a wrong type, out of range or incompatible."""
     check_number("ratio", ratio)
     if not 0 < ratio <= 1:
         raise ValueError(f"ratio must be above 0 and at most 1, got {ratio:g}")

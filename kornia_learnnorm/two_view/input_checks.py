@@ -16,7 +16,7 @@ MODELS = ("auto", "fundamental", "homography")
 MAX_THRESHOLD = 1000.0  # pixels
 MAX_FOCAL = 1e9  # pixels; poses of far longer ones are rounding
 MIN_INSIDE = 0.8  # of the points of an image
-FAR = 3.0  # times what nine of ten coordinates stay below; a farther point says nothing of its image's size
+FAR = 3.0  # times the 90th percentile of the coordinates; farther points do not count for the size of the image
 Points = Tensor | NDArray[Any]
 Cameras = tuple[Tensor, Tensor]
 
@@ -53,7 +53,7 @@ def read_cameras(K1: Points | None, K2: Points | None) -> Cameras | None:
 
 
 def read_size(name: str, size: Size | Points | None, points: Tensor) -> Size:
-    """Return the width and height of an image, pixels; as large as its points (N, 2) need when not given.
+    """Return the width and height of an image, pixels; when not given, the smallest that holds its points.
 
     Four of five points must lie inside; undistortion moves only a few beyond the borders.
     """

@@ -29,11 +29,11 @@ from kornia_learnnorm.two_view.input_checks import check_number, check_settings
 from kornia_learnnorm.two_view.result import CONVENTION, NoReliableMatrixError, package_versions
 
 RESULTS = "pairs.jsonl"  # one line a pair, in the order in which they are done
-TABLE = "pairs.csv"  # the same without the matches; the pairs of the last run come first, in their order
+TABLE = "pairs.csv"  # one row a pair, without the matches; the pairs of the last run come first, in their order
 COLUMNS = ("model", "num_matches", "num_inliers", "predicted_error_px", "F", "H", "E", "R", "t", "n")  # of the table
 OPTIONS = "options.json"
 MAX_PASSES = 100  # of MatchRefiner, which takes a few
-UNREADABLE = "unreadable"  # code of a pair of which an image or its camera cannot be read; tried again by the next run
+UNREADABLE = "unreadable"  # code of a pair with an image or camera that cannot be read; the next run tries again
 
 FilePair = tuple[Path, Path]
 Line = dict[str, Any]  # the JSON object of a pair
@@ -116,7 +116,7 @@ def estimate_pairs(
     """
     folder = Path(folder)
     cameras = [text if text == "exif" else read_camera(text).tolist() for text in options.K]
-    _modules(options.weights, options.refine)  # wrong weights are an error of the options, not of each pair
+    _modules(options.weights, options.refine)  # raise for wrong weights once, not for each pair
     given = json.loads(json.dumps({**asdict(options), "K": cameras}))
     folder.mkdir(parents=True, exist_ok=True)
     with exclusive(folder):

@@ -26,12 +26,12 @@ def choose_model(
 ) -> tuple[ModelChoice, Solution | None, Tensor | None]:
     """Return the choice, and the fundamental matrix and the homography (3, 3) where they were sought and found.
 
-    With ``"auto"`` it is the homography where one, with a radial distortion, explains most inliers of the fundamental
-    matrix, the parallax of the others is no more than chance (as in L. Moisan, B. Stival, IJCV 2004), and the
-    homography has the smaller GRIC; then random parts of the matches are not searched for a better fundamental matrix.
-    With cameras, nine tenths of the essential matrix's inliers are enough in the place of GRIC.
-    It is the homography, too, where this search has failed: it found none, or one with fewer than three quarters of the
-    homography's inliers, all of which agree with some fundamental matrix.
+    ``"auto"`` chooses the homography if one, with a radial distortion, explains most inliers of the fundamental matrix,
+    the parallax of the others is no more than chance (as in L. Moisan, B. Stival, IJCV 2004), and the homography has
+    the smaller GRIC (with cameras, nine tenths of the essential matrix's inliers are enough instead). Random parts of
+    the matches are then not searched for a better fundamental matrix. It also chooses the homography if this search
+    fails: it finds no fundamental matrix, or one with fewer than three quarters of the homography's inliers, although
+    some fundamental matrix fits all of these.
     """
     H_mat = None if model == "fundamental" else solver.homography(size2)
     agree = None if H_mat is None else int(solver.support(H_mat, "homography"))

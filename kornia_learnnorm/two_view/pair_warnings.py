@@ -19,7 +19,7 @@ SEARCH_SAMPLES = 50_000  # minimal samples of a search that finds nothing
 MAX_LOG_FALSE_ALARMS = -2.0  # log10 of the expected number of random models with as much support
 MIN_MISFIT = 5e-5  # of the largest coordinate, about the longer side; photographs called undistorted have up to 3e-5
 MAX_LOG_CHANCE_MISFIT = -3.0  # log10 of the probability that noise alone adds as much
-MIN_POSE_CHANGE = 3.0  # degrees; a lens that distorts a little contradicts its camera too, and does less harm
+MIN_POSE_CHANGE = 3.0  # degrees; a slight lens distortion contradicts the camera too, but hardly changes the pose
 CONTRADICTION = "the matches contradict K1 and K2"
 MIN_FOCAL = 0.05  # of the median coordinate of points, about half of the image; no lens is as wide
 MAX_FOCAL, MAX_ASPECT = 100.0, 2.0  # of the largest coordinate of points, and of the other focal length
@@ -30,7 +30,7 @@ class PairWarning(NamedTuple):
     """A reason to doubt a matrix."""
 
     code: str  # few_inliers, chance, clustered, planar, relief, small_motion, unstable, ambiguous, no_pose or cameras
-    text: str  # one sentence for people
+    text: str  # one sentence for the user
 
 
 def find_warnings(
@@ -74,8 +74,8 @@ def log_false_samples(matches: int, inliers: int, threshold: float, size: Size) 
     """Return log10 of the expected number of a search's samples with as many inliers among random matches.
 
     A search tries the three matrices of 50,000 samples of seven, far fewer than all that :func:`log_false_alarms`
-    counts. A true matrix with too few inliers to be told from all those can have more than a search among random
-    matches finds.
+    counts. A true matrix can have too few inliers to stand out among all of those, and still more than a search
+    among random matches finds.
     """
     others = max(0, inliers - Fundamental.sample_size)
     samples = 3 * SEARCH_SAMPLES * math.comb(max(0, matches - Fundamental.sample_size), others)

@@ -1,9 +1,9 @@
 r"""The homography of a scene that is mostly a plane, the parallax of the rest, and the matrix of both.
 
 With the homography :math:`H` of the plane, two matches off the plane determine the epipole :math:`e_2`, since the line
-through :math:`H x_1` and :math:`x_2` passes through it, and :math:`F = [e_2]_\times H`. What one radial
-distortion of both images explains is no parallax. Points are pixels (N, 2) in float64, matrices (3, 3), and thresholds
-pixels.
+through :math:`H x_1` and :math:`x_2` passes through it, and :math:`F = [e_2]_\times H`. Offsets that one radial
+distortion of both images explains do not count as parallax. Points are pixels (N, 2) in float64, matrices (3, 3), and
+thresholds pixels.
 """
 
 import math
@@ -30,14 +30,14 @@ from kornia_learnnorm.ransac.scoring import PairScorer
 OFF_PLANE = 2.0  # thresholds, or standard deviations; a match that the homography misses by more is off the plane
 MAX_SAMPLES = 1000  # pairs of matches off the plane that are tried
 MAX_PAIRED = 2000  # matches off the plane of which all pairs are listed
-MIN_PARALLAX_INLIERS = 3  # matches off the plane that a matrix must have to be more than a choice of two
+MIN_PARALLAX_INLIERS = 3  # matches off the plane that must agree on an epipole, since any two determine one
 MAX_DISTORTION = 0.2  # of the radius at the corners of an image
 MAX_LM_STEPS = 10
 TOLERANCE = 1e-6  # cosine of offsets and derivatives at which Levenberg-Marquardt has converged
 MIN_PLANAR_SHARE = 0.5  # of the inliers on one homography; below, the scene is no plane
 NOISE = (1.0, 0.5, 0.25, 0.125)  # thresholds; noise that is tried, SIFT errs by 0.1 px or so
 MAX_LOG_CHANCE_PARALLAX = -3.0  # log10 of the expected number of epipoles that chance gives as much parallax
-NEARLY_PLANE = 0.8  # of the inliers within the threshold of one homography; from it on, signs must agree, too
+NEARLY_PLANE = 0.8  # of the inliers within the threshold of one homography; above, signs of offsets must agree, too
 MIN_SIGNS, MAX_SIGNS = 100, 2000  # matches off the plane; fewer are too far apart to share a side, more are thinned
 AT_INFINITY = 1e6  # halves of the diagonal; offset of a point that the homography moves to infinity
 
@@ -55,7 +55,7 @@ class Parallax(NamedTuple):
         return self.wide > MIN_PLANAR_SHARE and self.log_chance > MAX_LOG_CHANCE_PARALLAX
 
     def describe(self, threshold: float) -> str:
-        """Return one sentence for people."""
+        """Return one sentence for the user."""
         text = f"one homography explains {self.near:.0%} of the inliers within {threshold:g} px and {self.wide:.0%} "
         text += f"within {3 * threshold:g} px"
         if self.planar:

@@ -18,7 +18,7 @@ NOMINAL_FOCAL = 1.2  # of the longer image side: focal length where no camera is
 COMMON_ERRORS = 400  # matches beyond which more do not help: the errors of neighbours are alike
 MEDIAN_SQUARE = 0.455  # of a standard normal variable
 MIN_NOISE = 1e-6  # thresholds; of matches without noise
-CAMERA_ERROR = 1e-4  # of the longer image side, in photographs: what matches do not tell, such as distortion
+CAMERA_ERROR = 1e-4  # of the longer image side, in photographs: errors that matches do not reveal, such as distortion
 
 
 class PredictedError(NamedTuple):
@@ -64,8 +64,8 @@ def predict_transfer_error(
 ) -> PredictedError:
     """Return the standard errors of points that ``H_mat`` moves, and of its pose.
 
-    The latter is that of the angles (P,) to the poses of parts, zero without them. Other arguments are as for
-    :func:`predict_error`.
+    The error of the pose is computed from the angles (P,) to the poses of parts, zero without them. Other arguments are
+    those of :func:`predict_error`.
     """
     x1 = points1[inliers]
     distance = parallax(x1, transform_points(H_mat[None], x1[None])[0], H_parts).median()

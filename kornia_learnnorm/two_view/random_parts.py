@@ -1,4 +1,4 @@
-"""Random parts of the matches, which are solved again: their matrices tell how far that of all matches may be off."""
+"""Random parts of the matches, which are solved again: their spread shows how far the estimate may be off."""
 
 import torch
 from torch import Tensor
@@ -7,12 +7,12 @@ from kornia_learnnorm.data.images import Size
 from kornia_learnnorm.two_view.pair_warnings import MAX_LOG_FALSE_ALARMS, log_false_alarms, log_false_samples
 
 NUM_PARTS = 12  # random parts of the matches that are solved again
-PART_INLIERS = 48  # expected in a part, where these are more than half and less than four fifths of all inliers
-MIN_SUPPORT = 0.75  # of the inliers; the matrix of a part with fewer is that of a search that failed
-MIN_SOLVED_PARTS = 4  # with fewer matrices of as much support, those of all parts count
-FEW_MATCHES = 400  # so few determine a matrix only with more inliers than RANSAC misses again and again
-MAX_FAILED_PARTS = 6  # parts of few matches that are no better than chance, as all matches, before the search ends
-MAX_EMPTY_PARTS = 2  # parts with no more inliers than a search among random matches finds, before the search ends
+PART_INLIERS = 48  # inliers expected in a part, unless it had less than half or more than four fifths of the matches
+MIN_SUPPORT = 0.75  # of the inliers; with fewer, the search in a part has failed
+MIN_SOLVED_PARTS = 4  # with fewer parts that have not failed, all parts count
+FEW_MATCHES = 400  # matches; if so few determine a matrix, RANSAC cannot miss its many inliers in every part
+MAX_FAILED_PARTS = 6  # parts of few matches without a result better than chance, before the search ends
+MAX_EMPTY_PARTS = 2  # parts without a result better than a search among random matches, before the search ends
 
 
 def draw_parts(number: int, inliers: int, seed: int) -> Tensor:
@@ -24,9 +24,9 @@ def draw_parts(number: int, inliers: int, seed: int) -> Tensor:
 
 
 def are_in_vain(tried: int, matches: int, inliers: int, threshold: float, size2: Size) -> bool:
-    """Return whether so many parts of few matches found no more inliers than chance, and the others needn't be solved.
+    """Return whether to stop after ``tried`` parts, as they found no more inliers than chance; only for few matches.
 
-    Of more matches a late part can find what all others missed.
+    Among more matches, a late part can find what all others missed.
     """
     if matches > FEW_MATCHES:
         return False
@@ -36,6 +36,6 @@ def are_in_vain(tried: int, matches: int, inliers: int, threshold: float, size2:
 
 
 def drop_failed_parts(F_parts: Tensor, support: Tensor, inliers: int) -> Tensor:
-    """Return the matrices of parts (P, 3, 3) whose support (P,) is most inliers; all of them where these are few."""
+    """Return the matrices (P, 3, 3) with a support (P,) of 3/4 of the inliers; all if there are fewer than four."""
     solved = support >= MIN_SUPPORT * inliers
     return F_parts[solved] if int(solved.sum()) >= MIN_SOLVED_PARTS else F_parts

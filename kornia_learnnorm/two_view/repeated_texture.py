@@ -1,9 +1,9 @@
-r"""False matches of repeated texture, which agree with each other: how they show, and the estimate without them.
+r"""Detect false matches of repeated texture, which agree with each other, and estimate without them.
 
 Equal windows of a wall match each other along its rows, so that the false matches agree on an epipole where these rows
-meet, and on a matrix that more matches fit than the true one. Which matches fit cannot tell these matrices apart; that
-the false matches jump away from their neighbours, and are nearest neighbours in one direction only, does. Points are
-pixels (N, 2) in float64, matrices (3, 3), and thresholds pixels.
+meet, and on a matrix that more matches fit than the true one. The number of inliers cannot tell these matrices
+apart, but false matches move differently from their neighbours and are nearest neighbours in one direction only. Points
+are pixels (N, 2) in float64, matrices (3, 3), and thresholds pixels.
 """
 
 from collections.abc import Callable
@@ -20,20 +20,20 @@ from kornia_learnnorm.two_view.parallax import MAX_LOG_CHANCE_PARALLAX, find_mai
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 
 NUM_NEIGHBOURS = 48  # matches nearest to a match in an image
-ROUNDS = 2  # in the second, neighbours count by their own share in the first
-MIN_COHERENT = 0.8  # of the weights of the neighbours, in both images, have the parallax of a coherent match
+ROUNDS = 2  # in the second, neighbours are weighted by their own share in the first
+MIN_COHERENT = 0.8  # of the weights of the neighbours, in both images, agree with a coherent match's parallax
 MAX_PARALLAX_CHANGE = 0.3  # of the distance between neighbours; 3 thresholds where this is less
 PARALLAX = 3.0  # thresholds; a match that the homography misses by more lies off the plane
-MIN_MATCHES_OFF_PLANE = 16  # fewer tell nothing of a matrix
+MIN_MATCHES_OFF_PLANE = 16  # with fewer, shares of them are not reliable
 MIN_FALSE_SHARE = 0.15  # of the false matches off the plane; as many fit the true matrix by chance
 MAX_FALSE_SHARE = 0.3  # of the false matches off the plane; more fit only a matrix that they decided
-MAX_SHARE_LEFT = 0.8  # of the false matches per coherent one that fit the first matrix, for another to replace it
+MAX_SHARE_LEFT = 0.8  # of the first matrix's false matches per coherent one, which a second one must stay below
 MIN_COHERENT_SHARE = 2 / 3  # of the coherent matches off the plane; with fewer, another matrix is sought
 MIN_AGREEING_SHARE = 0.8  # of the inliers of either matrix off the plane that fit the other one, for them to be alike
 
 
 def mutual_share(points1: Tensor, points2: Tensor, mutual: Tensor, F_mat: Tensor, threshold: float) -> float:
-    """Return which share of the neighbours off the main plane that fit are mutual; 1 where fewer than 16 are off.
+    """Return the share of mutual matches among those off the main plane that fit F; 1 if they are fewer than 16.
 
     Nearly all true matches are, so a low share means false matches that agree with each other.
     """
@@ -49,8 +49,8 @@ def resolve_ambiguity(
 ) -> PairEstimate:
     """Return the estimate of the coherent matches where false ones decided the first, with a warning where in doubt.
 
-    It replaces the first one if fewer false matches, not mutual, fit its matrix for each coherent one that does. There
-    is no doubt where both matrices say the same. ``again`` maps a mask of the first one's matches to their estimate.
+    It replaces the first one if fewer false (not mutual) matches fit its matrix for each coherent match that does. If
+    both matrices agree, there is no warning. ``again`` maps a mask of the first one's matches to their estimate.
     """
     inlying = first.points1[first.inliers], first.points2[first.inliers]
     H, coherent = find_main_plane(*inlying, first.threshold), torch.zeros_like(first.inliers)
@@ -70,7 +70,7 @@ def resolve_ambiguity(
     def fitting(F_mat: Tensor) -> list[float]:  # shares of the false and of the coherent matches off the plane
         return [fitting_share(*x, plane, F_mat, first.threshold) for x in ((false1, false2), matches)]
 
-    def doubtful(estimate: PairEstimate, true: float) -> bool:  # whether the coherent matches do not speak for it
+    def doubtful(estimate: PairEstimate, true: float) -> bool:  # whether the coherent matches do not support it
         if true < MIN_COHERENT_SHARE and (estimate is first or estimate.E_mat is not None):
             return True
         evidence = parallax_evidence(*matches, estimate.matrix, parallax(*matches, plane), first.threshold)
@@ -137,7 +137,7 @@ def _neighbours(points: Tensor, vectors: Tensor, least: float) -> tuple[Tensor, 
 
 
 def fitting_share(points1: Tensor, points2: Tensor, H: Tensor, F_mat: Tensor, threshold: float) -> float:
-    """Return which share of the matches off the plane of a homography fits a matrix; 1 where fewer than 16 are off."""
+    """Return the share of the matches off the plane of a homography that fits a matrix; 1 if fewer than 16 are off."""
     off = parallax(points1, points2, H) > PARALLAX * threshold
     fits = symmetric_epipolar_distance(points1[off], points2[off], F_mat) < threshold
     return float(fits.double().mean()) if len(fits) >= MIN_MATCHES_OFF_PLANE else 1.0

@@ -29,10 +29,10 @@ class NoReliableMatrixError(ValueError):
 
 
 class ModelChoice(NamedTuple):
-    """The model of the result, and the numbers that decided; None where a matrix was not sought or not found."""
+    """The model of the result and the numbers behind the choice; None where a matrix was not sought or not found."""
 
     model: str  # "fundamental" or "homography"
-    reason: str  # one sentence for people
+    reason: str  # one sentence for the user
     parallax: Parallax | None = None  # of the matches of the fundamental matrix
     fundamental_inliers: int | None = None
     homography_inliers: int | None = None
@@ -41,13 +41,13 @@ class ModelChoice(NamedTuple):
 
     @property
     def by_gric(self) -> str | None:
-        """Name of the model of smaller GRIC; None where there are not two."""
+        """Name of the model of smaller GRIC; None unless both matrices were found."""
         if self.fundamental_gric is None or self.homography_gric is None:
             return None
         return "fundamental" if self.fundamental_gric < self.homography_gric else "homography"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the reason and the numbers as what JSON can hold."""
+        """Return the fields as values for JSON."""
         return {**self._asdict(), "parallax": self.parallax and self.parallax._asdict()}
 
 
@@ -79,7 +79,7 @@ class PairEstimate:
     front: Tensor | None = None  # mask of the matches in front of both cameras, (N,), bool; None without cameras
     n: Tensor | None = None  # unit normal (3,) of the plane, n^T X1 > 0; None without cameras or a plane
     other_pose: PlanePose | None = None  # second pose and normal that the plane allows; None if there is only one
-    rows: Tensor | None = None  # index of each match among those given to estimate_matches, (N,); None of two images
+    rows: Tensor | None = None  # index of each match among those given to estimate_matches, (N,); else None
 
     @property
     def model(self) -> str:
@@ -108,7 +108,7 @@ class PairEstimate:
         return median(distance(self.points1[self.inliers], self.points2[self.inliers], self.matrix)).item()
 
     def as_dict(self, matches: bool = True) -> dict[str, Any]:
-        """Return all fields, or all but those of each match, as values for JSON."""
+        """Return the fields as values for JSON, without those of single matches if ``matches`` is false."""
 
         def view(path: Path | None, size: tuple[int, int]) -> dict[str, Any]:
             return {"file": None if path is None else str(path), "width": size[0], "height": size[1]}

@@ -1,4 +1,4 @@
-"""The matrices of matches by RANSAC or a learned layer, plane and parallax, and parts of the matches."""
+"""Estimate matrices by RANSAC or a learned layer, from a plane and parallax, and from random parts of the matches."""
 
 import math
 from dataclasses import dataclass, replace
@@ -27,22 +27,22 @@ from kornia_learnnorm.two_view.random_parts import are_in_vain, draw_parts, drop
 from kornia_learnnorm.two_view.result import NoReliableMatrixError
 
 Model = Literal["fundamental", "homography"]
-MIN_MATCHES = 9  # eight are explained by some matrix whatever they are
-MIN_SCORE_GAIN = 1.02  # of another hypothesis over the one found first, which otherwise stays
-MIN_SCORE = 1e-3  # a match of weight zero would never be sampled
+MIN_MATCHES = 9  # any eight matches fit some fundamental matrix
+MIN_SCORE_GAIN = 1.02  # of another hypothesis over the first one, to replace it
+MIN_SCORE = 1e-3  # smallest weight, since a match of weight zero would never be sampled
 NEAR = 20.0  # thresholds; among the matches this near a matrix, fewer are false than among all
-MIN_NEAR = 16  # matches near a matrix, for a search among them
+MIN_NEAR = 16  # smallest number of matches near a matrix for a search among them
 MAX_NEAR_SEARCHES = 3
 MIN_INLIER_SHARE = 0.5  # of the matches; with as many inliers, the first search finds the best matrix
 MAX_SAMPLES = 50_000  # of RANSAC
-PART_SAMPLES = 5_000  # of five matches of a part: where a quarter are inliers, one has no outlier with 99 %
-FREE_SHARE = 0.8  # of the inliers without cameras, which right cameras exceed
+PART_SAMPLES = 5_000  # samples of five in a part: with 25 % inliers, one is free of outliers with 99 % probability
+FREE_SHARE = 0.8  # of the inliers without cameras; correct cameras have more
 MISSED = 1e-4  # probability that no sample is free of outliers
 MIN_LOSS_SCALE = 1e-3  # thresholds; of the loss for matches without noise
 
 
 class Solution(NamedTuple):
-    """The fundamental matrix or homography of all matches, and what tells how far it may be off."""
+    """The fundamental matrix or homography of all matches, and those of random parts, which show its uncertainty."""
 
     matrix: Tensor  # (3, 3)
     weights: Tensor  # of the matches as the estimator sees them, (N,)
@@ -94,7 +94,7 @@ class TwoViewSolver:
         return Solution(H_mat, inliers.double(), solved, parts.shape[1])
 
     def solve(self) -> Solution:
-        """Return the fundamental matrix of the matches without a look at parts of them."""
+        """Return the fundamental matrix of all matches, without solving random parts."""
         if self.layer is None:
             found = self._ransac()
             F_mat, weights = found.F_mat, found.inliers.double()
@@ -121,9 +121,9 @@ class TwoViewSolver:
         return int(self.support(replace(self, cameras=None)._ransac().F_mat))  # noqa: SLF001 (its own class)
 
     def limit_samples(self, free: int) -> Self:
-        """Return the solver with the samples with cameras that 0.8 of ``free``, the inliers without cameras, take.
+        """Return a solver that draws as many samples with cameras as 0.8 times ``free`` inliers require.
 
-        Right cameras have more inliers. Wrong ones have fewer, and RANSAC would draw all samples in vain.
+        ``free`` are the inliers without cameras. Correct cameras have more; with wrong ones, samples would be wasted.
         """
         hit_rate = (FREE_SHARE * free / len(self.scores)) ** Essential.sample_size
         samples = MAX_SAMPLES if hit_rate == 0 else math.ceil(math.log(MISSED) / math.log1p(-hit_rate))
@@ -141,7 +141,7 @@ class TwoViewSolver:
         return other if self._score(other) > least else F_mat
 
     def refine(self, F_mat: Tensor) -> Tensor:
-        """Return the matrix refined on the robust loss with which RANSAC ends, of known cameras if there are."""
+        """Return the matrix after RANSAC's final fit, under the constraint of the cameras if they are known."""
         start = self.scorer.best(self.scorer.from_pixels(F_mat[None]), 1)
         if len(start.F_mat) == 0:
             return F_mat
@@ -177,7 +177,7 @@ class TwoViewSolver:
         return ransac.estimate(self.points1, self.points2, self.scores.clamp(min=MIN_SCORE), *cameras)
 
     def _solve_parts(self, F_mat: Tensor, parts: Tensor, size2: Size) -> Tensor:
-        """Return the matrices of the parts, only of the first where these are in vain."""
+        """Return the matrices of the parts, or of the first few if they find no more than chance."""
         found = F_mat[None]
         solver = replace(self, max_samples=min(self.max_samples, PART_SAMPLES))
         for tried, rows in enumerate(parts, 1):
@@ -187,7 +187,7 @@ class TwoViewSolver:
         return found[1:]
 
     def _search_near(self, F_mat: Tensor) -> Tensor:
-        """Return a matrix (3, 3), or a better one of the matches near it, which has most true ones and few others."""
+        """Return a matrix (3, 3), or a better one from the matches near it, which are mostly inliers."""
         for _ in range(MAX_NEAR_SEARCHES):
             distance = self.distance(F_mat)
             near = distance < NEAR * self.threshold
@@ -219,8 +219,8 @@ class TwoViewSolver:
         evidence = parallax.parallax_evidence(self.points1, self.points2, F_mat, off_plane, self.threshold, (1.0,))
         if evidence <= parallax.MAX_LOG_CHANCE_PARALLAX or not bool(inliers.any()):
             return F_mat
-        # Parallax that is smaller than the threshold decides the epipole of a scene that is nearly a plane. So would
-        # the inliers of largest error, if the scale of the loss were not the median distance of the inliers.
+        # In a nearly planar scene, parallax smaller than the threshold decides the epipole. With the median distance of
+        # the inliers as the scale of the loss, the inliers of largest error do not outweigh it.
         scale = distance[inliers].median().clamp(MIN_LOSS_SCALE * self.threshold, LOSS_SCALE * self.threshold)
         matches = self.points1[None], self.points2[None]
         return refine_fundamental(*matches, F_mat[None], loss=GemanMcClure(float(scale))).F_mat[0]
