@@ -15,7 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print a configuration, or the names of all."""
+    """Print a configuration, or the names of all configurations."""
     text = "\n".join(config_names()) if args.name is None else find_config(args.name).read_text(encoding="utf-8")
     print(text.rstrip())
     return 0

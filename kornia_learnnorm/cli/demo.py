@@ -1,4 +1,4 @@
-"""The command ``learnnorm demo``: a page in the browser to try two images on."""
+"""The command ``learnnorm demo``: a browser page to try two of your images."""
 
 import argparse
 import os

@@ -35,17 +35,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("images", metavar="IMG", type=Path, nargs="*", help=argparse.SUPPRESS)  # in the usage
     parser.add_argument("--out", metavar="PATH", type=Path, help="picture of the matches; with --pairs, a folder")
     parser.add_argument("--json", metavar="FILE", help="write the result to this file; -: standard output")
-    parser.add_argument("--matches", action="store_true", help="with the matches in the JSON")
+    parser.add_argument("--matches", action="store_true", help="include the matches in the JSON")
     parser.add_argument("--strict", action="store_true", help="exit with 3 where there are warnings")
     add = parser.add_argument_group("estimation").add_argument
     names, default = ("ransac", "learned"), "(default: %(default)s)"
     add("--model", metavar="NAME", choices=MODELS, default=options.model, help=f"{', '.join(MODELS)} {default}")
     add("--estimator", metavar="NAME", choices=names, default=names[0], help=f"{', '.join(names)} {default}")
-    add("--weights", metavar="NAME_OR_PATH", help="of the learned one (default: robust-synthetic)")
+    add("--weights", metavar="NAME_OR_PATH", help="weights for learned (default: robust-synthetic)")
     distance = f"largest distance of inliers {default}"
     add("--threshold", metavar="PX", type=float, default=options.threshold, help=distance)
     add("--seed", metavar="N", type=int, default=options.seed, help=default)
-    add("--K", metavar="CAMERA", nargs="+", default=[], help="1 or 2: fx,fy,cx,cy, a file, exif; adds R, t, in JSON E")
+    add("--K", metavar="CAMERA", nargs="+", default=[], help="1 or 2: fx,fy,cx,cy, a file or exif; gives R, t")
     group = parser.add_argument_group("matching")
     add_feature_arguments(group)
     add = group.add_argument
@@ -53,13 +53,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--max-size", metavar="PX", type=int, default=options.max_size, help=f"longer side of the images {default}")
     passes = f"passes of MatchRefiner, 2 for XFeat {default}"
     add("--refine", metavar="PASSES", type=int, default=options.refine, help=passes)
-    add("--mask", metavar="FILE", type=Path, nargs="+", default=[], help="one or two: features count where it is white")
+    add("--mask", metavar="FILE", type=Path, nargs="+", default=[], help="1 or 2 images: use features where white")
     many = parser.add_argument_group("many pairs")
-    many.add_argument("--pairs", metavar="LIST", type=Path, help="two files a line, or a folder; results in --out")
+    many.add_argument("--pairs", metavar="LIST", type=Path, help="list of two files a line, or a folder; needs --out")
     add = many.add_mutually_exclusive_group().add_argument
     # The default as text: argparse would not see "--gap 1" beside --exhaustive if the values were the same object.
-    add("--gap", metavar="N", type=int, default="1", help=f"of a folder: images N apart {default}")
-    add("--exhaustive", dest="gap", action="store_const", const=None, help="of a folder: all pairs")
+    add("--gap", metavar="N", type=int, default="1", help=f"for a folder: pair images N apart {default}")
+    add("--exhaustive", dest="gap", action="store_const", const=None, help="for a folder: all pairs")
     add = many.add_mutually_exclusive_group().add_argument
     add("--jobs", type=int, default=-1, help=f"processes; -1: all cores {default}")
     add("--dask", metavar="ADDRESS", help="scheduler of Dask's workers: tcp://host:8786")
@@ -104,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _estimate(args: argparse.Namespace, options: many_pairs.PairOptions) -> PairEstimate:
-    """Return the estimate of one pair after its picture and its JSON file are written, both or neither."""
+    """Write the picture and the JSON file of one pair, both or neither, and return its estimate."""
     with ExitStack() as stack:
         picture, report = (path and stack.enter_context(atomic_write(path)) for path in (args.out, _json_path(args)))
         if picture:

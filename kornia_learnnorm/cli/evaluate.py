@@ -32,12 +32,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "normalisers or weights, with +LM or +optimal or without; module:Name for your own (default: none, Hartley,"
     text += f" whitening, reweighted, {', '.join(SHIPPED)}, searched)"
     add("--methods", metavar="NAME", nargs="+", help=text)
-    add("--weights", metavar="NAME_OR_PATH", nargs="+", help="further weights; the methods or their default stay")
+    add("--weights", metavar="NAME_OR_PATH", nargs="+", help="weights to evaluate in addition to the methods")
     add("--seed", type=int, default=0, help="seed of the shuffle (default: %(default)s)")
     text = "leave out samples whose mean symmetric epipolar distance under the un-normalised eight-point algorithm is"
     text += " this or larger (default: %(default)g; inf: none)"
     add("--max-residual", type=float, metavar="PX", default=SampleOptions.max_residual, help=text)
-    text = "at most so many samples of each store and protocol, at random (default: %(default)s; 0: all)"
+    text = "largest number of random samples per store and protocol (default: %(default)s; 0: all)"
     add("--max-samples", metavar="N", type=int, default=SampleOptions.max_samples, help=text)
     add("--size", metavar="N", type=int, default=8, help="correspondences in a sample (default: %(default)s)")
     text = "folder to keep the predictions in, with everything that learnnorm report shows; the default methods are"
@@ -52,7 +52,7 @@ def add_json_argument(parser: argparse.ArgumentParser) -> None:
 
 @contextmanager
 def json_tables(args: argparse.Namespace, inputs: Sequence[str] = ()) -> Iterator[list[Table]]:
-    """Give a list for the tables of a command, written as ``--json`` says when the block ends; inputs stay."""
+    """Yield a list for the tables of a command, written as ``--json`` asks at the end; never over an input file."""
     tables: list[Table] = []
     if args.json in (None, "-"):
         yield tables

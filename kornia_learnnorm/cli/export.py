@@ -17,12 +17,12 @@ learnnorm export robust --format onnx --out robust.onnx"""
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``learnnorm export`` to a parser."""
     add = parser.add_argument
-    add("weights", metavar="NAME_OR_PATH", help="weights that ship, a file of them, or MODULE:FILE of your own parts")
-    add("--format", choices=["pt2", "onnx"], required=True, help="pt2: the layer, in minutes; onnx: its networks")
-    text = "file to write, .pt2 or .onnx; of several networks, FILE-stage1.onnx and so on"
+    add("weights", metavar="NAME_OR_PATH", help="name of shipped weights, a file, or MODULE:FILE with your own parts")
+    add("--format", choices=["pt2", "onnx"], required=True, help="pt2: the layer, takes minutes; onnx: its networks")
+    text = "file to write, .pt2 or .onnx; several networks are written to FILE-stage1.onnx and so on"
     add("--out", metavar="FILE", type=Path, required=True, help=text)
-    add("--inputs", metavar="INPUT", nargs="+", default=[], help="besides the points: weights, mask, scores")
-    add("--points", metavar="N", type=int, help="fixed number of correspondences; without it, any from 9 on")
+    add("--inputs", metavar="INPUT", nargs="+", default=[], help="inputs besides the points: weights, mask, scores")
+    add("--points", metavar="N", type=int, help="fixed number of correspondences (default: any number from 9 on)")
 
 
 def run(args: argparse.Namespace) -> int:

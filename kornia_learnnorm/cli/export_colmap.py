@@ -28,21 +28,21 @@ KEEP_CAMERA = ", pycolmap.IncrementalPipelineOptions(ba_refine_focal_length=Fals
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``learnnorm export-colmap`` to a parser."""
-    parser.add_argument("root", metavar="ROOT", type=Path, help="folder of the images; its subfolders count")
+    parser.add_argument("root", metavar="ROOT", type=Path, help="folder of the images, with its subfolders")
     parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="the database to write")
     pairs = parser.add_argument_group("pairs (default: all)").add_mutually_exclusive_group()
     pairs.add_argument("--overlap", metavar="N", type=int, help="only images up to N apart, by name")
     pairs.add_argument("--pairs", metavar="FILE", type=Path, help="two names a line, as hloc lists them")
-    text = "a store of learnnorm match, or hloc's features and matches, in place of matching"
+    text = "use a store of learnnorm match, or hloc's features and matches, instead of matching"
     pairs.add_argument("--matches", metavar="STORE", type=Path, nargs="+", default=[], help=text)
     add = parser.add_argument_group("cameras").add_argument
-    add("--K", metavar="CAMERA", help="of all images: fx,fy,cx,cy or a file (default: EXIF)")
+    add("--K", metavar="CAMERA", help="camera of all images: fx,fy,cx,cy or a file (default: EXIF)")
     add("--single-camera", action="store_true", help="all images share one camera")
     add = parser.add_argument_group("estimation").add_argument
-    add("--weights", metavar="NAME_OR_PATH", help="a learned layer in the place of RANSAC")
-    text = "of RANSAC; inliers within twice of it (default: %(default)s)"
+    add("--weights", metavar="NAME_OR_PATH", help="estimate with a learned layer instead of RANSAC")
+    text = "threshold of RANSAC; inliers are within twice this (default: %(default)s)"
     add("--threshold", metavar="PX", type=float, default=THRESHOLD, help=text)
-    add("--seed", metavar="N", type=int, default=0, help="of RANSAC (default: %(default)s)")
+    add("--seed", metavar="N", type=int, default=0, help="seed of RANSAC (default: %(default)s)")
     add_matching_arguments(parser.add_argument_group("matching"))
 
 

@@ -46,10 +46,10 @@ learnnorm {0} --config crossview --ckpt_path run/checkpoints/last.ckpt
 learnnorm {0} --config crossview --config own.yaml --ckpt_path last.ckpt"""
 TOOLS = {
     "estimate": ("kornia_learnnorm.cli.estimate", "the fundamental matrix or homography of two images"),
-    "demo": ("kornia_learnnorm.cli.demo", "a page in the browser to try two images on"),
+    "demo": ("kornia_learnnorm.cli.demo", "a browser page to try two of your images"),
     "evaluate": ("kornia_learnnorm.cli.evaluate", "better rates and errors on stores of correspondences"),
     "robust": ("kornia_learnnorm.cli.robust", "robust estimators on stores"),
-    "report": ("kornia_learnnorm.cli.report", "tables and figures of what evaluate --out and robust wrote"),
+    "report": ("kornia_learnnorm.cli.report", "tables and figures of a run of evaluate --out or robust"),
     "match": ("kornia_learnnorm.cli.match", "a store of correspondences from folders of images"),
     "export-colmap": ("kornia_learnnorm.cli.export_colmap", "a COLMAP database from a folder of images"),
     "synthesize": ("kornia_learnnorm.cli.synthesize", "a synthetic store and a rendered image pair"),
@@ -69,8 +69,8 @@ FOLDERS = ("FOLDER", "ROOT", "RUN")
 def main(args: Sequence[str] | None = None) -> int:
     """Run a command, from ``sys.argv`` if None, and return its exit code.
 
-    It is 0; 2 after an error, whose message is printed as one line; 130 when interrupted; 141, as of a program that the
-    signal SIGPIPE ends, when the reader of the output, such as ``head``, has ended.
+    It is 0; 2 after an error, whose message is printed as one line; 130 when interrupted; 141, the code for SIGPIPE,
+    when the reader of the output, such as ``head``, has closed it.
     """
     words = list(sys.argv[1:] if args is None else args)
     try:
@@ -86,7 +86,7 @@ def main(args: Sequence[str] | None = None) -> int:
         print("interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still in the buffer
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # takes what is still in the buffer
         return 141
     except (ValueError, OSError, ImportError) as error:
         text = str(error)
@@ -97,9 +97,9 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def make_parser(names: Collection[str] = (*TRAINING, *TOOLS)) -> argparse.ArgumentParser:
-    """Return the parser of the command line, with the arguments of the named commands only, whose modules are imported.
+    """Return the parser of the command line; only the modules of the named commands are imported, for their arguments.
 
-    It knows the options of a training that are needed most, for its help; LightningCLI parses them, with all others.
+    Of the training options, only the most common are listed in the help; LightningCLI parses these and all others.
     """
     parser = argparse.ArgumentParser(prog="learnnorm", formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.description, parser.epilog = "F, E and H from matches with outliers", _examples(EXAMPLES)
@@ -132,7 +132,7 @@ def _add_training_arguments(parser: argparse.ArgumentParser, name: str) -> None:
     parser.add_argument("--help-all", action="store_true", help="list all options: the entries of a configuration")
     text = "configuration: a name that learnnorm config lists, or a file; can be repeated, later entries win"
     parser.add_argument("--config", metavar="NAME_OR_FILE", action="append", required=True, help=text)
-    text = "checkpoint of the run to go on with" if name == "fit" else "checkpoint of the run"
+    text = "checkpoint of the run to continue" if name == "fit" else "checkpoint of the run"
     parser.add_argument("--ckpt_path", metavar="FILE", required=name != "fit", help=text)
     parser.add_argument("--trainer.default_root_dir", metavar="FOLDER", help="folder to write to")
     if name == "fit":
@@ -140,7 +140,7 @@ def _add_training_arguments(parser: argparse.ArgumentParser, name: str) -> None:
     parser.add_argument("--trainer.accelerator", metavar="NAME", help="device: auto, cpu, gpu")
     parser.add_argument("--data.batch_size", metavar="N", help="sets in a batch")
     if name == "fit":
-        parser.add_argument("--print_config", action="store_true", help="print the whole configuration and end")
+        parser.add_argument("--print_config", action="store_true", help="print the whole configuration and exit")
     if name in MEASURED:
         from kornia_learnnorm.cli.evaluate import add_json_argument
 
@@ -156,7 +156,7 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
     def add_usage(
         self, usage: str | None, actions: Iterable[argparse.Action], groups: Iterable[Any], prefix: str | None = None
     ) -> None:
-        """Name optional arguments by one word: they are listed below."""
+        """Show optional arguments as [options]: they are listed below."""
         required = [group for group in groups if group.required]
         members = {id(action) for group in required for action in group._group_actions}  # noqa: SLF001
         shown = [a for a in actions if a.required or id(a) in members or (not a.option_strings and a.nargs == "?")]
@@ -190,7 +190,7 @@ def _run_tool(words: list[str]) -> int:
 
 
 def _run_training(words: list[str]) -> int:
-    """Run a training command; ``--json`` takes the metrics that it prints."""
+    """Run a training command; ``--json`` writes the metrics that it prints."""
     training = import_extra("lightning_modules.training_command", "train", "training")
     words = ["--help" if word == "--help-all" else word for word in words]
     if words[0] not in MEASURED:

@@ -27,13 +27,13 @@ READER_OPTIONS = ("sequences", "split", "camera", "max_difference", "model")  # 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``learnnorm match`` to a parser."""
     parser.add_argument("reader", metavar="DATASET", choices=[*DATASETS], help=f"one of {', '.join(DATASETS)}")
-    parser.add_argument("root", metavar="ROOT", type=Path, help="its folder")
+    parser.add_argument("root", metavar="ROOT", type=Path, help="folder of the dataset")
     parser.add_argument("--out", metavar="STORE.h5", type=Path, required=True, help="the store to write")
     frames = parser.add_argument_group("frames")
-    frames.add_argument("--sequences", metavar="NAME", nargs="+", help="kitti, tum: these sequences")
+    frames.add_argument("--sequences", metavar="NAME", nargs="+", help="kitti, tum: only these sequences")
     frames.add_argument("--split", metavar="NAME", help="kitti, cambridge: train, test; tum: train, val")
     frames.add_argument("--camera", help="kitti: image_0 to image_3 (default: image_0)")
-    frames.add_argument("--model", metavar="FOLDER", type=Path, help="colmap: cameras, images and points")
+    frames.add_argument("--model", metavar="FOLDER", type=Path, help="colmap: folder of cameras, images and points")
     frames.add_argument("--max-difference", metavar="S", type=float, help="tum: seconds to a pose (default: 0.02)")
     frames.add_argument("--resize", metavar=("WIDTH", "HEIGHT"), nargs=2, type=int, help="resize images and cameras")
     pairs = parser.add_argument_group("pairs").add_mutually_exclusive_group()
@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     pairs.add_argument("--exhaustive", dest="gap", action="store_const", const=None, help="all pairs of frames")
     match = parser.add_argument_group("matching")
     add_matching_arguments(match)
-    _add_number(match, "max_matches", "per pair, of those that fail the ratio test and of others; 0 keeps all")
+    _add_number(match, "max_matches", "kept per pair that fail, and that pass, the ratio test; 0: all")
     _add_number(match, "seed", "seed of the order of matches")
 
 
@@ -59,7 +59,7 @@ def add_feature_arguments(parser: argparse._ActionsContainer) -> None:
 def add_matching_arguments(match: argparse._ArgumentGroup) -> None:
     """Add the arguments that say which features are matched, how, and where it is computed."""
     add_feature_arguments(match)
-    _add_number(match, "num_features", "of an image")
+    _add_number(match, "num_features", "features kept per image")
     where = match.add_mutually_exclusive_group()
     where.add_argument("--jobs", type=int, default=-1, help="processes here; -1 for all cores (default: %(default)s)")
     where.add_argument("--dask", metavar="ADDRESS", help="scheduler of Dask's workers: tcp://host:8786")

@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text += f" (default: {' '.join(DEFAULT_ESTIMATORS)})"
     parser.add_argument("--estimators", metavar="NAME", nargs="+", default=[*DEFAULT_ESTIMATORS], help=text)
     counts = {
-        "pairs": "of each store, evenly spaced; 0: all",
+        "pairs": "pairs of each store, evenly spaced; 0: all",
         "seeds": "runs on each pair",
         "slow_seeds": "runs of the estimators that can take a second: all except opencv-* and learned:*",
         "seed": "the first seed",
