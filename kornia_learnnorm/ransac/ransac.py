@@ -92,8 +92,8 @@ class RANSAC(nn.Module):
             the sum of both squared transfer errors.
 
     Raises:
-        TypeError: if ``normalizer`` cannot be called, or ``inl_th``, ``confidence``, ``max_seconds`` or ``seed`` is not
-            a number.
+        TypeError: if ``normalizer`` cannot be called, ``model`` is no model, or ``inl_th``, ``confidence``,
+            ``max_seconds`` or ``seed`` is not a number.
         ValueError: if a number is out of its range, ``max_samples`` is not whole, or ``model``, ``distance`` or
             ``rank2`` is an unknown name.
 
@@ -191,17 +191,17 @@ class RANSAC(nn.Module):
             dtype of the points, the number of samples and the score; no gradients. ``F_mat`` also holds a homography,
             from :math:`N \ge 4` matches of which more than four are inliers.
 
-            If no matrix of rank 2 has more than eight inliers (five with cameras), or fewer than eight (five) weights
-            are positive, the matrix is zero and there are no inliers. If every sample is degenerate, as on a plane
+            If no matrix has more than eight inliers (five with cameras, four for a homography), or fewer weights than
+            that are positive, the matrix is zero and there are no inliers. If every sample is degenerate, as on a plane
             without noise or without motion, the matrix is one of those that fit; with cameras, at most two fit a plane.
 
         Raises:
             TypeError: if the points are not floating-point tensors of one dtype, or weights or cameras not
                 floating-point.
             ShapeError: if a shape is wrong.
-            ValueError: if there are fewer than eight rows, or five with cameras, the views do not pair up, a weight is
-                negative or not finite, only one camera is given, or one is not a finite and invertible (3, 3) matrix
-                with a last row of (0, 0, w > 0).
+            ValueError: if there are fewer than eight rows (five with cameras, four for a homography), the views do not
+                pair up, a weight is negative or not finite, only one camera is given, or one is not a finite and
+                invertible (3, 3) matrix with a last row of (0, 0, w > 0).
         """
         check_cameras(K1, K2)
         if K1 is not None and not isinstance(self.model, Fundamental):

@@ -93,6 +93,7 @@ def estimate_matches(
 
     Raises:
         NoReliableMatrixError: if there are fewer than nine matches or inliers, or no motion.
+        ImportError: if OpenCV, of the extra ``images``, is not installed.
         TypeError: if an argument is not of its type.
         ValueError: if shapes do not pair up, a value is out of range, over a fifth of the points lies outside of its
             image, or a camera is missing or not invertible.
