@@ -137,8 +137,8 @@ def main(args: Sequence[str] | None = None) -> tuple[float, float]:
     options = parser.parse_args(args)
     layer, lightglue = pretrained()
     pairs = read_pairs(lightglue, options.folders)
-    if len(pairs) < 2:
-        parser.error(f"two or more pairs of at least {MIN_MATCHES} matches expected in the folders, got {len(pairs)}")
+    if len(pairs) < 1 + (options.steps > 0):  # one is held out
+        parser.error(f"the folders have {len(pairs)} pairs of {MIN_MATCHES} or more matches, expected 2 or more")
     torch.manual_seed(0)
     weigh = MatchWeights()
     before = held_out_loss(layer, weigh, pairs[::6])
