@@ -66,7 +66,7 @@ class EpipolarLoss(nn.Module):
     ) -> Tensor:
         """Return the loss, a scalar, of pixels (B, N, 2) and held-out ones (B, M, 2) under matrices (B, 3, 3).
 
-        ValueError if ``heldout_weight`` is positive and there are no held-out correspondences.
+        ValueError if there are no correspondences, or no held-out ones although ``heldout_weight`` is positive.
         """
         own = _distances(self.residual, points1, points2, F_mat, self.ceiling).mean(-1)
         loss = (own + self.floor).log().mean() if self.log else own.mean()
@@ -111,7 +111,7 @@ class BoundedEpipolarLoss(nn.Module):
         self.scale, self.residual = scale, residual
 
     def forward(self, points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
-        """Return the loss of each set, (B,), of matches (B, M, 2) x 2 under matrices (B, 3, 3)."""
+        """Return the loss of each set, (B,), of one or more matches (B, M, 2) x 2 under matrices (B, 3, 3)."""
         squared = _distances(self.residual, points1, points2, F_mat).square()
         return (squared / (squared + self.scale**2)).mean(-1).to(F_mat.dtype)
 
@@ -136,7 +136,7 @@ class LogEpipolarLoss(nn.Module):
         self.floor, self.residual = floor, residual
 
     def forward(self, points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
-        """Return the loss of each set, (B,), of correspondences (B, M, 2) x 2 under matrices (B, 3, 3)."""
+        """Return the loss of each set, (B,), of one or more correspondences (B, M, 2) x 2 under matrices (B, 3, 3)."""
         return (_distances(self.residual, points1, points2, F_mat) + self.floor).log().mean(-1).to(F_mat.dtype)
 
 

@@ -123,7 +123,7 @@ def transfer_distance(points1: Tensor, points2: Tensor, H_mat: Tensor) -> Tensor
 
     Returns:
         distances in pixels with shape :math:`(B, N)` or :math:`(N,)`; the largest number of the dtype under a singular
-        matrix.
+        matrix, NaN where a point or the matrix has one.
 
     Reference:
         R. Hartley, A. Zisserman, Multiple View Geometry, 2nd edition, Eq. 4.7.
@@ -140,7 +140,7 @@ def transfer_distance(points1: Tensor, points2: Tensor, H_mat: Tensor) -> Tensor
         H_mat = H_mat.expand(len(points1), 3, 3)
     with without_autocast(points1):
         distance: Tensor = symmetric_transfer_error(points1, points2, H_mat, squared=False)
-    unknown = (points1 + points2).isnan().any(-1) | H_mat.isnan().flatten(-2).any(-1, keepdim=True)
+    unknown = (points1.isnan() | points2.isnan()).any(-1) | H_mat.isnan().flatten(-2).any(-1, keepdim=True)
     distance = distance.masked_fill(unknown, torch.nan)  # Kornia replaces NaN by the distance under a singular matrix
     return distance[0] if single else distance
 

@@ -8,7 +8,7 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from kornia.geometry.epipolar import essential_from_fundamental, motion_from_essential
 from torch import Tensor
 
-from kornia_learnnorm.geometry.checks import check_cameras, check_mask, check_tensor, solve_dtype
+from kornia_learnnorm.geometry import checks
 
 
 def relative_pose(
@@ -35,7 +35,8 @@ def relative_pose(
         :class:`~kornia_learnnorm.LearnedRelativePose` for a loss of the pose.
 
     Raises:
-        TypeError: if a tensor is not floating-point or the mask is not boolean.
+        TypeError: if the points are not float32 or float64 of one dtype, a matrix or camera is not floating-point, or
+            the mask is not boolean.
         ShapeError: if a shape is wrong.
         ValueError: if the points do not pair up, the batches differ, the mask does not fit the points, or a camera is
             not finite and invertible with a last row of (0, 0, w > 0).
@@ -50,20 +51,13 @@ def relative_pose(
         >>> bool((R - scene.R).abs().max() < 1e-6)
         True
     """
-    check_tensor("F_mat", F_mat, ["B", "3", "3"])
-    check_cameras(K1, K2, len(F_mat))
+    checks.check_pairs(points1, points2, ["B", "N", "2"])
+    checks.check_number_of_matrices("F_mat", F_mat, len(points1))
+    checks.check_cameras(K1, K2, len(F_mat))
     K1, K2 = (K.expand(len(F_mat), 3, 3) for K in (K1, K2))
-    named = {"F_mat": F_mat, "K1": K1, "K2": K2, "points1": points1, "points2": points2}
-    for name, value in named.items():
-        check_tensor(name, value, ["B", "N", "2"] if name.startswith("points") else ["B", "3", "3"])
-    if points1.shape != points2.shape:
-        raise ValueError(f"points1 and points2 must pair up, got shapes {[*points1.shape]} and {[*points2.shape]}")
-    sizes = {name: len(value) for name, value in named.items()}
-    if len(set(sizes.values())) > 1:
-        raise ValueError(f"all must be of one batch, got {sizes}")
     if mask is not None:
-        check_mask(mask, points1, points2)
-    dtype, work = F_mat.dtype, solve_dtype(F_mat.device)
+        checks.check_mask(mask, points1, points2)
+    dtype, work = F_mat.dtype, checks.solve_dtype(F_mat.device)
     F_mat, K1, K2, points1, points2 = (value.to(work) for value in (F_mat, K1, K2, points1, points2))
     E_mat = essential_from_fundamental(F_mat, K1, K2)
     E_mat = torch.where(E_mat.isfinite().all(-1, keepdim=True).all(-2, keepdim=True), E_mat, 0.0)

@@ -86,6 +86,7 @@ class TestRelativePose:
     def test_exceptions(self):
         for change, error, message in [
             (lambda F, K1, K2, a, b: (F.int(), K1, K2, a, b), TypeError, "F_mat must be .* got torch.int32"),
+            (lambda F, K1, K2, a, b: (F, K1, K2, a.half(), b), TypeError, "points1 must be .* got torch.float16"),
             (lambda F, K1, K2, a, b: (F, K1, K2, a.tolist(), b), TypeError, "points1 must be .* <class 'list'>"),
             (lambda F, K1, K2, a, b: (F[0], K1, K2, a, b), ShapeError, "shape"),
             (lambda F, K1, K2, a, b: (F, K1[:, :2], K2, a, b), ValueError, "shape"),
@@ -98,6 +99,6 @@ class TestRelativePose:
             (lambda F, K1, K2, a, b: (F, NAN * K1, K2, a, b), ValueError, r"K1 must be finite .* got \[\[nan"),
             (lambda F, K1, K2, a, b: (F, -K1, K2, a, b), ValueError, "^K1 .*got -0 -0 -1; transposed"),
             (lambda F, K1, K2, a, b: (F, K1, K2.mT.requires_grad_(), a, b), ValueError, "^K2 .* 1; transposed"),
-            (lambda F, K1, K2, a, b: (F, K1, K2, a[:2], b[:2]), ValueError, "one batch, got {'F_mat': 3, 'K1': 3"),
+            (lambda F, K1, K2, a, b: (F, K1, K2, a[:2], b[:2]), ValueError, "one matrix per set .* 3 .* 2 sets"),
         ]:
             raises(error, message, relative_pose, *change(*pair("orbit", 3, 10)[0]))
