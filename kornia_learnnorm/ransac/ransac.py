@@ -21,6 +21,7 @@ from kornia_learnnorm.models.two_view_model import TwoViewModel
 from kornia_learnnorm.normalizers.closed_form import Hartley
 from kornia_learnnorm.normalizers.normalizer import Normalizer, check_normalizer
 from kornia_learnnorm.ransac.argument_checks import check_matches, check_numbers
+from kornia_learnnorm.ransac.dominant_plane import try_dominant_plane
 from kornia_learnnorm.ransac.fits import fit_final, optimize_locally
 from kornia_learnnorm.ransac.minimal_solver import solve_minimal_samples
 from kornia_learnnorm.ransac.samplers import Sampler, UniformSampler, WeightedSampler
@@ -53,8 +54,10 @@ class RANSAC(nn.Module):
     solved in batches, and MSAC scores their matrices. Local optimisation fits the best matrices of each batch
     to their inliers by reweighted least squares, and the best of them also by the DLT with the normaliser. The inlier
     ratio of the best matrix so far decides how many samples are still needed. If it is low, or the samples run out, the
-    last samples are drawn from the matches near that matrix. In the final fit, the best matrices are fitted with the
-    Geman-McClure loss, and the one of least cost is refined by Levenberg-Marquardt if it has not converged.
+    last samples are drawn from the matches near that matrix. If most inliers of a fundamental matrix lie on a plane,
+    and the others could agree by chance, the matrix of this plane and of the parallax of the other matches is tried as
+    well. In the final fit, the best matrices are fitted with the Geman-McClure loss, and the one of least cost is
+    refined by Levenberg-Marquardt if it has not converged.
 
     With both cameras, minimal samples of five run through Nister's five-point solver, and local optimisation and the
     final fit are least squares on essential matrices; distances stay in pixels. If a fundamental matrix fits
@@ -99,7 +102,7 @@ class RANSAC(nn.Module):
 
     Reference:
         P. Torr, A. Zisserman, MLESAC, CVIU 2000 (MSAC); O. Chum, J. Matas, J. Kittler, Locally optimized RANSAC, DAGM
-        2003.
+        2003; O. Chum, T. Werner, J. Matas, Two-view geometry estimation unaffected by a dominant plane, CVPR 2005.
 
     Example:
         >>> import kornia_learnnorm as kln
@@ -245,6 +248,8 @@ class RANSAC(nn.Module):
         scorer = PairScorer(x1, x2, self.inl_th, self.model, scored)
         scorer = scorer if cameras is None else scorer.of_cameras(*cameras)
         pool, drawn = self._search(scorer, sampler, generator)
+        if self.refine and isinstance(scorer.model, Fundamental) and not isinstance(scorer.model, Essential):
+            pool = try_dominant_plane(scorer, pool, generator)
         if len(pool.F_mat) == 0:
             return _failure(points1, drawn, cameras)
         state = fit_final(scorer, pool) if self.refine else scorer.model.state(pool.F_mat[:1])

@@ -79,9 +79,9 @@ class PairScorer:
         """Return matrices (K, 3, 3) of the scorer's coordinates in pixels."""
         return self.model.carry(F_mat, self.T1, self.T2)
 
-    def best(self, F_mat: Tensor, number: int) -> Hypotheses:
-        r"""Return the at most ``number`` matrices of highest score that have an inlier."""
-        scores = self._scores(F_mat, self.terms)
+    def best(self, F_mat: Tensor, number: int, rows: Rows = slice(None)) -> Hypotheses:
+        r"""Return the at most ``number`` matrices of highest score, on some of the scored rows, that have an inlier."""
+        scores = self._scores(F_mat, self.terms[:, rows])
         score, order = scores.topk(min(number, len(scores)))
         positive = int((score > 0).sum())
         return Hypotheses(F_mat[order[:positive]], score[:positive])

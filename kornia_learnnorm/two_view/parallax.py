@@ -1,9 +1,7 @@
-r"""The homography of a scene that is mostly a plane, the parallax of the rest, and the matrix of both.
+r"""The homography of a scene that is mostly a plane, and the parallax of the rest.
 
-With the homography :math:`H` of the plane, two matches off the plane determine the epipole :math:`e_2`, since the line
-through :math:`H x_1` and :math:`x_2` passes through it, and :math:`F = [e_2]_\times H`. Offsets that one radial
-distortion of both images explains do not count as parallax. Points are pixels (N, 2) in float64, matrices (3, 3), and
-thresholds pixels.
+Offsets that one radial distortion of both images explains do not count as parallax. Points are pixels (N, 2) in
+float64, matrices (3, 3), and thresholds pixels.
 """
 
 import math
@@ -13,23 +11,17 @@ from typing import NamedTuple, Self
 import numpy as np
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
-from kornia.geometry.epipolar import cross_product_matrix, left_to_right_epipolar_distance
+from kornia.geometry.epipolar import left_to_right_epipolar_distance
 from torch import Tensor
 
 from kornia_learnnorm.data.images import Size, import_cv2
 from kornia_learnnorm.estimators.optimize import RobustCost, minimize
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.transforms import affine_transform
-from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.models.two_view_model import Residuals
-from kornia_learnnorm.ransac.samplers import draw_distinct
-from kornia_learnnorm.ransac.scoring import PairScorer
 
 OFF_PLANE = 2.0  # thresholds, or standard deviations; a match that the homography misses by more is off the plane
-MAX_SAMPLES = 1000  # pairs of matches off the plane that are tried
-MAX_PAIRED = 2000  # matches off the plane of which all pairs are listed
 MIN_PARALLAX_INLIERS = 3  # matches off the plane that must agree on an epipole, since any two determine one
 MAX_DISTORTION = 0.2  # of the radius at the corners of an image
 MAX_LM_STEPS = 10
@@ -158,28 +150,6 @@ def sign_evidence(points1: Tensor, points2: Tensor, F_mat: Tensor, offsets: Tens
             information = sum(share * math.log10(2 * share) for share in (agree, 1 - agree) if share > 0)
             evidence = min(evidence, math.log10(len(NOISE)) - len(pairs) * information)
     return evidence if most >= MIN_SIGNS else -math.inf
-
-
-def fit_plane_and_parallax(points1: Tensor, points2: Tensor, H: Tensor, threshold: float, seed: int) -> Tensor | None:
-    """Return the fundamental matrix (3, 3) of a homography and an epipole that most matches agree with.
-
-    None where fewer than three matches are off the plane. The threshold is on the Sampson distance (O. Chum, T. Werner,
-    J. Matas, Two-view geometry estimation unaffected by a dominant plane, CVPR 2005).
-    """
-    off = (parallax(points1, points2, H) > OFF_PLANE * threshold).nonzero()[:, 0]
-    if len(off) < MIN_PARALLAX_INLIERS:
-        return None
-    generator = torch.Generator().manual_seed(seed)
-    if len(off) <= MAX_PAIRED:
-        pairs = torch.combinations(off)
-        chosen = pairs[torch.randperm(len(pairs), generator=generator)[:MAX_SAMPLES]]
-    else:  # the time and memory of all pairs grow with the square of the matches
-        chosen = off[draw_distinct(torch.full((MAX_SAMPLES,), len(off)), 2, generator)]
-    x1, x2 = (convert_points_to_homogeneous(points[chosen]) for points in (points1, points2))
-    epipole = torch.linalg.cross(*torch.linalg.cross(x1 @ H.mT, x2).unbind(1))
-    scorer = PairScorer(points1, points2, threshold, Fundamental())
-    found = scorer.best(scorer.from_pixels(unit_matrix(cross_product_matrix(epipole) @ H)), 1).F_mat
-    return unit_matrix(scorer.to_pixels(found))[0] if len(found) else None
 
 
 def offsets_from_plane(

@@ -17,6 +17,7 @@ from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.models.essential import Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.models.homography import Homography
+from kornia_learnnorm.ransac.dominant_plane import fit_parallax
 from kornia_learnnorm.ransac.fits import LOSS_SCALE, fit_final
 from kornia_learnnorm.ransac.ransac import RANSAC, RansacResult
 from kornia_learnnorm.ransac.scoring import PairScorer
@@ -211,9 +212,11 @@ class TwoViewSolver:
         off_plane = self.distance(H, "homography")
         if float((off_plane[inliers] < 3 * self.threshold).double().mean()) <= parallax.MIN_PLANAR_SHARE:
             return F_mat
-        other = parallax.fit_plane_and_parallax(self.points1, self.points2, H, self.threshold, self.seed)
-        if other is not None and self._score(other := self.refine(other)) > MIN_SCORE_GAIN * self._score(F_mat):
-            F_mat = other
+        generator, scorer = torch.Generator().manual_seed(self.seed), self.scorer
+        found = fit_parallax(scorer, scorer.T2 @ H @ torch.linalg.inv(scorer.T1), generator)
+        for other in scorer.to_pixels(found.F_mat):
+            if self._score(other := self.refine(other)) > MIN_SCORE_GAIN * self._score(F_mat):
+                F_mat = other
         distance = self.distance(F_mat)
         inliers = distance < self.threshold
         evidence = parallax.parallax_evidence(self.points1, self.points2, F_mat, off_plane, self.threshold, (1.0,))

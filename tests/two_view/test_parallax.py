@@ -1,4 +1,4 @@
-"""The matrix of a plane and parallax, the evidence for an epipole, and distances from a plane that a lens bends."""
+"""The evidence for an epipole, and distances from a plane that a lens bends."""
 
 import math
 
@@ -7,44 +7,16 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from references import epipolar_distances
+from plane_scene import H, make_scene
 
 import kornia_learnnorm as kln
+from kornia_learnnorm.geometry.matrices import unit_matrix
+from kornia_learnnorm.models.fundamental import Fundamental
+from kornia_learnnorm.ransac.dominant_plane import fit_parallax
+from kornia_learnnorm.ransac.scoring import PairScorer
 from kornia_learnnorm.two_view import parallax as module
 
-K = np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
-R = np.array([[0.9998, 0, 0.02], [0, 1, 0], [-0.02, 0, 0.9998]])
-t = np.array([0.4, 0.05, 0.1])
-H = torch.from_numpy(K @ (R + np.outer(t, [0, 0, 1]) / 5) @ np.linalg.inv(K))  # of the plane Z = 5
 ROWS = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]]).double()  # epipolar lines are the rows
-
-
-def make_scene(plane: int, off: int, outliers: int, noise: float, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
-    """Matches of points on the plane, off it, and random ones."""
-    rng = np.random.default_rng(seed)
-    depth = np.concatenate([np.full(plane, 5.0), rng.uniform(3, 4.7, off)])
-    x1 = rng.uniform([0, 0], [640, 480], (plane + off, 2))
-    X = np.c_[x1, np.ones(len(x1))] @ np.linalg.inv(K).T * depth[:, None]
-    x2 = (X @ R.T + t) @ K.T
-    x2 = x2[:, :2] / x2[:, 2:]
-    x1, x2 = (x + rng.normal(0, noise, x.shape) for x in (x1, x2))
-    wrong = rng.uniform([0, 0, 0, 0], [640, 480, 640, 480], (outliers, 4))
-    return torch.from_numpy(np.r_[x1, wrong[:, :2]]), torch.from_numpy(np.r_[x2, wrong[:, 2:]])
-
-
-class TestFit:
-    def test_exact(self):
-        points1, points2 = make_scene(200, 5, 0, 0.0)
-        F_mat = module.fit_plane_and_parallax(points1, points2, H, 1.0, 0)
-        assert np.abs(epipolar_distances(points1, points2, F_mat)).max() < 1e-5
-        assert float(F_mat.norm()) == pytest.approx(1)
-        assert module.fit_plane_and_parallax(*make_scene(50, 2, 0, 0.0), H, 1.0, 0) is None  # nothing is off the plane
-
-    def test_few_matches_off_the_plane_among_outliers(self, monkeypatch):
-        monkeypatch.setattr(module, "MAX_PAIRED", 5)
-        points1, points2 = make_scene(300, 15, 60, 0.3)
-        F_mat = module.fit_plane_and_parallax(points1, points2, H, 1.0, 0)
-        assert np.median(epipolar_distances(points1[300:315], points2[300:315], F_mat)) < 1.0
 
 
 class TestEvidence:
@@ -81,7 +53,9 @@ class TestEvidence:
     def test_of_a_plane_there_is_none(self, seed):
         """Although the epipole is the best one, and a third of the matches is random."""
         points = make_scene(200, 0, 100, 0.5, seed)
-        F_mat = module.fit_plane_and_parallax(*points, H, 1.0, 0)
+        scorer = PairScorer(*points, 1.0, Fundamental())
+        found = fit_parallax(scorer, scorer.T2 @ H @ torch.linalg.inv(scorer.T1), torch.Generator().manual_seed(0))
+        F_mat = unit_matrix(scorer.to_pixels(found.F_mat))[0]
         evidence = module.parallax_evidence(*points, F_mat, module.parallax(*points, H), 1.0)
         assert evidence > module.MAX_LOG_CHANCE_PARALLAX
 
