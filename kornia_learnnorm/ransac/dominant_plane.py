@@ -24,13 +24,13 @@ from kornia_learnnorm.ransac.scoring import Hypotheses, PairScorer
 PLANES = 64  # samples of three inliers that are tried; one in five is on a plane that holds 60 % of them
 ON_PLANE = 3.0  # thresholds; matches this near the homography are those of the plane
 MIN_PLANAR_SHARE = 0.6  # of the inliers on one plane; below, no plane dominates
-# Log of the chance that matches off the plane agree as well with some epipole. Errors of matches on a plane are not
-# independent, so that it has to be far smaller than their directions alone would require.
-MIN_LOG_CHANCE = -100.0
-PLANE_SCALES = (3.0, 2.0, 1.5, 1.0, 1.0)  # thresholds of the steps of the homography's fit
+# Of the matches off the plane, and the log of the chance that so many agree with an epipole; a matrix that more agree
+# with has parallax. Errors of matches on a plane are not independent: the chance is larger than computed.
+MAX_EXPLAINED, MIN_LOG_CHANCE = 0.5, -30.0
+PLANE_SCALES = (3.0, 1.5, 1.0)  # thresholds of the steps of the homography's fit
 OFF_PLANE = 2.0  # thresholds; a match that the homography misses by more has parallax
 MIN_OFF_PLANE = 3  # matches off the plane that must agree on an epipole, since any two determine one
-EPIPOLES = 2000  # pairs of matches off the plane that are tried
+EPIPOLES = 1000  # pairs of matches off the plane that are tried
 FITTED = 4  # matrices of these that are fitted to their inliers
 MIN_EXPECTED = 1e-9  # inliers by chance, of matches that the plane moves to infinity
 MAX_COMPARED = 256  # matches on which planes and epipoles are compared
@@ -69,7 +69,9 @@ def find_dominant_plane(scorer: PairScorer, F: Tensor, generator: torch.Generato
     some1, some2 = inlying1[:, ::every], inlying2[:, ::every]
     on_plane = offsets(H.float(), some1.float(), some2.float()) < ON_PLANE * scorer.threshold
     share, best = on_plane.to(x1).mean(-1).max(0)
-    if float(share) <= MIN_PLANAR_SHARE or log_chance(scorer, offsets(H[best], x1, x2), inliers) < MIN_LOG_CHANCE:
+    off = offsets(H[best], x1, x2) / scorer.threshold
+    explained = float(inliers[off > ON_PLANE].to(x1).mean())
+    if float(share) <= MIN_PLANAR_SHARE or explained > MAX_EXPLAINED or log_chance(off, inliers) < MIN_LOG_CHANCE:
         return None
     losses = [Truncated(scale * scorer.threshold) for scale in PLANE_SCALES]
     fit = Homography().reweighted_fit(some1, some2, unit_matrix(H[best][None]), losses)
@@ -83,15 +85,15 @@ def offsets(H: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
     return torch.hypot(u * scale - x2[0], v * scale - x2[1]).nan_to_num_(nan=math.inf)
 
 
-def log_chance(scorer: PairScorer, distance: Tensor, inliers: Tensor) -> float:
+def log_chance(distance: Tensor, inliers: Tensor) -> float:
     r"""Return the log of the number of epipoles that have as many inliers off the plane by chance, at most.
 
-    A match at the distance :math:`r` (M,) from the plane, in a random direction from it, is an inlier with probability
-    :math:`2 / \pi \arcsin(\tau / r)`. Chernoff's bound, times the number of epipoles that two matches determine.
+    A match at the distance of :math:`r` thresholds (M,) from the plane, in a random direction from it, is an inlier
+    with probability :math:`2 / \pi \arcsin(1 / r)`. Chernoff's bound, times the epipoles that two matches determine.
     """
-    off = distance > ON_PLANE * scorer.threshold
+    off = distance > ON_PLANE
     number, agree = int(off.sum()), int(inliers[off].sum())
-    expected = max(2 / math.pi * float(torch.asin(scorer.threshold / distance[off]).sum()), MIN_EXPECTED)
+    expected = max(2 / math.pi * float(torch.asin(1 / distance[off]).sum()), MIN_EXPECTED)
     excess = agree * math.log(agree / expected) - agree + expected if agree > expected else 0.0
     return 2 * math.log(max(number, 1)) - excess
 

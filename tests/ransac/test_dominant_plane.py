@@ -55,15 +55,14 @@ class TestPlane:
             assert module.find_dominant_plane(scorer, F, generator()) is None
 
     def test_chance_by_hand(self):
-        """Of ten matches at twice the distance of the limit, six agree: a sixth of pi/2 over pi/2 would by chance."""
-        scorer, _ = scorer_and_plane(make_scene(10, 0, 0, 0.0))
+        """Six of ten matches at ten thresholds from the plane agree."""
         distance, inliers = torch.full((10,), 10.0), torch.arange(10) < 6
         expected = 10 * 2 / math.pi * math.asin(0.1)
-        found = module.log_chance(scorer, distance, inliers)
+        found = module.log_chance(distance, inliers)
         assert found == pytest.approx(math.log(100) - (6 * math.log(6 / expected) - 6 + expected))
-        assert module.log_chance(scorer, distance, inliers & False) == pytest.approx(math.log(100))
-        assert module.log_chance(scorer, torch.zeros(10), inliers) == 0  # nothing is off the plane
-        assert math.isfinite(module.log_chance(scorer, torch.full((10,), math.inf), inliers))
+        assert module.log_chance(distance, inliers & False) == pytest.approx(math.log(100))
+        assert module.log_chance(torch.zeros(10), inliers) == 0  # nothing is off the plane
+        assert math.isfinite(module.log_chance(torch.full((10,), math.inf), inliers))
 
 
 def errors(number: int = 12) -> list[float]:
