@@ -69,9 +69,10 @@ def find_dominant_plane(scorer: PairScorer, F: Tensor, generator: torch.Generato
     some1, some2 = inlying1[:, ::every], inlying2[:, ::every]
     on_plane = offsets(H.float(), some1.float(), some2.float()) < ON_PLANE * scorer.threshold
     share, best = on_plane.to(x1).mean(-1).max(0)
+    if float(share) <= MIN_PLANAR_SHARE:
+        return None
     off = offsets(H[best], x1, x2) / scorer.threshold
-    explained = float(inliers[off > ON_PLANE].to(x1).mean())
-    if float(share) <= MIN_PLANAR_SHARE or explained > MAX_EXPLAINED or log_chance(off, inliers) < MIN_LOG_CHANCE:
+    if float(inliers[off > ON_PLANE].to(x1).mean()) > MAX_EXPLAINED or log_chance(off, inliers) < MIN_LOG_CHANCE:
         return None
     losses = [Truncated(scale * scorer.threshold) for scale in PLANE_SCALES]
     fit = Homography().reweighted_fit(some1, some2, unit_matrix(H[best][None]), losses)
