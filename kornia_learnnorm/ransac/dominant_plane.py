@@ -34,7 +34,7 @@ EPIPOLES = 1000  # pairs of matches off the plane that are tried
 FITTED = 4  # matrices of these that are fitted to their inliers
 MIN_EXPECTED = 1e-9  # inliers by chance, of matches that the plane moves to infinity
 MAX_COMPARED = 256  # matches on which planes and epipoles are compared
-MIN_SCORE_GAIN = 1.01  # of the matrix of a plane and parallax over the best of the samples, to be kept
+MIN_SCORE_GAIN = 5.0  # inliers; of the matrix of a plane and parallax over the best of the samples, to be kept
 
 
 def try_dominant_plane(scorer: PairScorer, pool: Hypotheses, generator: torch.Generator) -> Hypotheses:
@@ -42,7 +42,7 @@ def try_dominant_plane(scorer: PairScorer, pool: Hypotheses, generator: torch.Ge
     if len(pool.F_mat) == 0 or (H := find_dominant_plane(scorer, pool.F_mat[:1], generator)) is None:
         return pool
     found = fit_parallax(scorer, H, generator)
-    if float(found.score.sum()) <= MIN_SCORE_GAIN * float(pool.score[0]):
+    if float(found.score.sum() - pool.score[0]) <= MIN_SCORE_GAIN:
         return pool
     return pool.join(found, scorer.model.pool_size)
 
