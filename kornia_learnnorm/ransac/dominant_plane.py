@@ -50,9 +50,9 @@ def try_dominant_plane(scorer: PairScorer, pool: Hypotheses, generator: torch.Ge
 def find_dominant_plane(scorer: PairScorer, F: Tensor, generator: torch.Generator) -> Tensor | None:
     r"""Return the homography (3, 3) of the plane that holds most inliers of a matrix (1, 3, 3), or None.
 
-    None where no plane holds 60 % of them, or the matches off it cannot agree with the matrix by chance. Of the
-    homographies :math:`[e_2]_\times F - e_2 v^\top` that agree with :math:`F`, three matches determine one (R. Hartley,
-    A. Zisserman, Multiple View Geometry, 2nd edition, result 13.6).
+    None where no plane holds 60 % of them, or where most of the matches off it, or more than would by chance, agree
+    with the matrix. Of the homographies :math:`[e_2]_\times F - e_2 v^\top` that agree with :math:`F`, three matches
+    determine one (R. Hartley, A. Zisserman, Multiple View Geometry, 2nd edition, result 13.6).
     """
     inliers = scorer.inliers(F)[0]
     x1, x2 = (x[:, scorer.rows] for x in (scorer.x1, scorer.x2))

@@ -7,13 +7,9 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from plane_scene import H, make_scene
+from plane_scene import H, fit_parallax, make_scene
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.geometry.matrices import unit_matrix
-from kornia_learnnorm.models.fundamental import Fundamental
-from kornia_learnnorm.ransac.dominant_plane import fit_parallax
-from kornia_learnnorm.ransac.scoring import PairScorer
 from kornia_learnnorm.two_view import parallax as module
 
 ROWS = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]]).double()  # epipolar lines are the rows
@@ -53,10 +49,7 @@ class TestEvidence:
     def test_of_a_plane_there_is_none(self, seed):
         """Although the epipole is the best one, and a third of the matches is random."""
         points = make_scene(200, 0, 100, 0.5, seed)
-        scorer = PairScorer(*points, 1.0, Fundamental())
-        found = fit_parallax(scorer, scorer.T2 @ H @ torch.linalg.inv(scorer.T1), torch.Generator().manual_seed(0))
-        F_mat = unit_matrix(scorer.to_pixels(found.F_mat))[0]
-        evidence = module.parallax_evidence(*points, F_mat, module.parallax(*points, H), 1.0)
+        evidence = module.parallax_evidence(*points, fit_parallax(points)[0], module.parallax(*points, H), 1.0)
         assert evidence > module.MAX_LOG_CHANCE_PARALLAX
 
 
