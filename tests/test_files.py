@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import pytest
+from scenes import raises
 
 from kornia_learnnorm import files
 from kornia_learnnorm.cli.main import main
@@ -33,16 +34,14 @@ def test_a_lock_is_refused_then_released_also_after_an_error_and_leaves_no_file(
     with exclusive(tmp_path / name):
         pass
     assert list(tmp_path.iterdir()) == []
-    with pytest.raises(OSError, match=r"cannot write .*store\.h5"):
-        exclusive(tmp_path / "none" / "store.h5").__enter__()
+    raises(OSError, r"cannot write .*store\.h5", exclusive(tmp_path / "none" / "store.h5").__enter__)
 
 
 def test_a_killed_process_does_not_block(tmp_path):
     command = [sys.executable, "-c", HOLD, str(tmp_path), files.__file__]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline() == "held\n"
-        with pytest.raises(BlockingIOError, match=f"{tmp_path} is in use by process {process.pid} on "):
-            exclusive(tmp_path).__enter__()
+        raises(BlockingIOError, f"{tmp_path} is in use by process {process.pid} on ", exclusive(tmp_path).__enter__)
         process.kill()
     assert (tmp_path / ".lock").is_file()
     with exclusive(tmp_path):

@@ -174,20 +174,19 @@ class TestParts:
         assert StoreWriter(path, OPTIONS).done() == {0, 2}
         assert not part.exists()
 
-    @pytest.mark.parametrize(
-        ("options", "message"),
-        [
+    def test_of_other_options_or_images(self, path):
+        StoreWriter(path, {**OPTIONS, "frames": "48af"}).add(0, pair(0))
+        for options, message in [
             ({"num_features": 300}, r"store\.h5\.parts was made .* num_features 200, now 300"),
             ({"frames": "3500"}, r"other data, remove .* the images, .* have changed since$"),
             ({"frames": "3500", "num_features": 300}, r": num_features 200, now 300$"),  # without the digests
-        ],
-    )
-    def test_of_other_options_or_images(self, path, options, message):
-        StoreWriter(path, {**OPTIONS, "frames": "48af"}).add(0, pair(0))
-        raises(ValueError, message, StoreWriter, path, {**OPTIONS, "frames": "48af", **options})
+        ]:
+            raises(ValueError, message, StoreWriter, path, {**OPTIONS, "frames": "48af", **options})
 
-    def test_folder_goes_if_nothing_is_in_it(self, path):
+    def test_nothing_is_written_without_pairs_and_the_folder_goes(self, path):
         writer = StoreWriter(path, OPTIONS)
+        raises(ValueError, "got 1 pairs and place -1", writer.add, -1, pair(0))
+        raises(ValueError, "no pairs to write", writer.finish, {})
         writer.close()
         assert list(path.parent.iterdir()) == []
 
@@ -197,11 +196,6 @@ class TestParts:
         writer.add(0, pair(0))
         (writer.folder / "options.json").write_text(text)
         raises(ValueError, r"store\.h5\.parts exists, but was not made by this command", StoreWriter, path, OPTIONS)
-
-    def test_wrong_arguments(self, path):
-        writer = StoreWriter(path, OPTIONS)
-        raises(ValueError, "got 1 pairs and place -1", writer.add, -1, pair(0))
-        raises(ValueError, "no pairs to write", writer.finish, {})
 
 
 NO_PROC = pytest.mark.skipif(not Path("/proc/self").exists(), reason="there is no /proc")

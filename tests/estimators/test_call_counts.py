@@ -18,7 +18,7 @@ FACTORISATIONS = ("linalg_lu_factor_ex", "_linalg_eigh", "_linalg_svd", "linalg_
 FACTORISATIONS += ("linalg_eigh", "linalg_svd", "linalg_det")
 
 
-def python_calls(function) -> tuple[int, int]:
+def python_calls(function, *arguments) -> tuple[int, int]:
     """Return how many calls of the package's own functions a call makes, and in how many files."""
     root, files = str(Path(kornia_learnnorm.__file__).parent), Counter()
 
@@ -26,30 +26,27 @@ def python_calls(function) -> tuple[int, int]:
         if event == "call" and frame.f_code.co_filename.startswith(root):
             files[frame.f_code.co_filename] += 1
 
-    function()
+    function(*arguments)
     sys.setprofile(profile)
     try:
-        function()
+        function(*arguments)
     finally:
         sys.setprofile(None)
     return files.total(), len(files)
 
 
 @pytest.mark.skipif(sys.version_info >= (3, 14), reason="what counts as a call differs between versions of Python")
-@pytest.mark.parametrize(
-    ("layer", "num_points", "most", "files"),
-    [
+@torch.no_grad()
+def test_python_calls_of_a_forward_pass():
+    for layer, num_points, most, files in [
         (EightPoint(), 8, 35, 6),
         (LearnedEightPoint.from_pretrained(), 50, 206, 15),  # sets of few outliers, which leave stages out
         (LearnedEightPoint.from_pretrained().train(), 50, 289, 18),
-    ],
-)
-def test_python_calls_of_a_forward_pass(layer, num_points, most, files):
-    points = correspondences("handheld", 4, num_points, seed=4)
-    with torch.no_grad():
-        calls, found = python_calls(lambda: layer(*points))
-    assert calls <= most
-    assert found <= files
+    ]:
+        points = correspondences("handheld", 4, num_points, seed=4)
+        calls, found = python_calls(layer, *points)
+        assert calls <= most
+        assert found <= files
 
 
 class Operations(TorchDispatchMode):
@@ -65,9 +62,8 @@ class Operations(TorchDispatchMode):
 
 
 @pytest.mark.skipif(torch.__version__ < "2.13", reason="older versions of PyTorch split operations into more")
-@pytest.mark.parametrize(
-    ("layer", "num_points", "most", "factorisations"),
-    [
+def test_operations_of_a_forward_pass():
+    for layer, num_points, most, factorisations in [
         (EightPoint(Hartley()), 8, 200, 1),
         (EightPoint(Whitening()), 8, 320, 1),
         (EightPoint(Hartley(), rank2="optimal"), 8, 381, 2),
@@ -76,12 +72,10 @@ class Operations(TorchDispatchMode):
         (EightPoint(Hartley()), 128, 232, 1),
         (LearnedEightPoint.from_pretrained(), 128, 2090, 5),
         (LearnedEightPoint.from_pretrained().train(), 128, 3290, 8),
-    ],
-)
-def test_operations_of_a_forward_pass(layer, num_points, most, factorisations):
-    points = correspondences("handheld", 64, num_points)
-    with torch.no_grad(), Operations() as operations:
-        layer(*points)
-    assert sum(operations.names.values()) <= most
-    assert sum(operations.names[name] for name in FACTORISATIONS) <= factorisations
-    assert sum(operations.names[name] for name in READS) <= (8 if isinstance(layer, LearnedEightPoint) else 3)
+    ]:
+        points = correspondences("handheld", 64, num_points)
+        with torch.no_grad(), Operations() as operations:
+            layer(*points)
+        assert sum(operations.names.values()) <= most
+        assert sum(operations.names[name] for name in FACTORISATIONS) <= factorisations
+        assert sum(operations.names[name] for name in READS) <= (8 if isinstance(layer, LearnedEightPoint) else 3)

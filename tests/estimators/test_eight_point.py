@@ -16,6 +16,8 @@ import kornia_learnnorm as kln
 from kornia_learnnorm import EightPoint, Hartley, ReweightedWhitening, Whitening, find_fundamental
 
 SLOW = ["reweighted", "learned", "estimator"]  # to compile
+COMPILED = [pytest.param(name, number, marks=pytest.mark.slow) for name in SLOW for number in (8, 12)]
+COMPILED += [("optimal", 8), ("hartley", 12)]
 
 
 @pytest.fixture(params=LAYERS)
@@ -228,13 +230,7 @@ class TestPrecision:
 
 @pytest.mark.long
 class TestBackEnds:
-    @pytest.mark.parametrize(
-        ("name", "num_points"),
-        [
-            *(("optimal", 8), ("hartley", 12)),
-            *(pytest.param(name, num_points, marks=pytest.mark.slow) for name in SLOW for num_points in (8, 12)),
-        ],
-    )
+    @pytest.mark.parametrize(("name", "num_points"), COMPILED)
     def test_compile(self, name, num_points):
         torch.compiler.reset()
         layer = LAYERS[name]()

@@ -267,6 +267,8 @@ def test_finite_on_degenerate_sets(kind, name):
 
 CHECKED = [("fundamental", "handheld", 20, {}), ("pose", "orbit", 12, {"stages": 1, "samples": 0})]
 CHECKED += [("homography", "", number, {"stages": 1}) for number in (12, 20)]
+FITTED = [("fundamental", n, options) for n in (8, 9) for options in ({}, {"rank2": "optimal"}, {"refine_steps": 0})]
+FITTED += [("pose", 20, {}), ("homography", 20, {})]
 
 
 @pytest.mark.parametrize(("kind", "scene", "number", "options"), CHECKED)
@@ -283,13 +285,7 @@ def test_gradients(kind, scene, number, options):
     check_gradients(numbers, points1, points2, uniform(*points1.shape[:2]), rtol=1e-2, **tolerances)
 
 
-@pytest.mark.parametrize(
-    ("kind", "number", "options"),
-    [
-        *(("fundamental", n, options) for n in (8, 9) for options in ({}, {"rank2": "optimal"}, {"refine_steps": 0})),
-        *(("pose", 20, {}), ("homography", 20, {})),
-    ],
-)
+@pytest.mark.parametrize(("kind", "number", "options"), FITTED)
 def test_every_parameter_gets_a_gradient(kind, number, options):
     """Otherwise DistributedDataParallel waits for the gradients that are missing."""
     layer = LAYERS[kind](**options)
@@ -363,10 +359,8 @@ class TestFiles:
             module.__dict__.update({name: p if p is None else p.detach() for name, p in module._parameters.items()})
             module._parameters.clear()
         assert torch.equal(loaded(*values), layer(*values))
-        for other in CLASSES.values():
-            if other is not type(layer):
-                with pytest.raises(ValueError, match=f"model '{layer.model_name}', expected '{other.model_name}'"):
-                    other.from_pretrained(file)
+        for cls in {*CLASSES.values()} - {type(layer)}:
+            raises(ValueError, f"model '{layer.model_name}', expected '{cls.model_name}'", cls.from_pretrained, file)
 
     @pytest.mark.parametrize("kind", ["fundamental", "homography"])
     def test_of_an_earlier_version(self, kind, tmp_path):
@@ -380,15 +374,13 @@ class TestFiles:
         assert CLASSES[kind].from_pretrained(tmp_path / "own.safetensors").samples == 64
 
     def test_garbled_architecture_or_weights_of_a_normaliser(self, tmp_path):
-        file = tmp_path / "own.safetensors"
+        file, load = tmp_path / "own.safetensors", kln.LearnedEightPoint.from_pretrained
         shaken_estimator().save_pretrained(file)
         for text in ("", "[]", '{"widht": 3}', '{"width": 10000}', '{"stages": 0}', '{"rank2": "no"}'):
             rewrite_weights(file, lambda _, metadata, text=text: metadata.update(architecture=text))
-            with pytest.raises(ValueError, match=r"own\.safetensors describes no estimator of this version"):
-                kln.LearnedEightPoint.from_pretrained(file)
-        with pytest.raises(ValueError, match=r"crossview: .* LearnedEightPoint.* LearnedNormalizer"):
-            kln.LearnedEightPoint.from_pretrained("crossview")
-        raises(TypeError, "expected a name or a path of weights, got None", kln.LearnedEightPoint.from_pretrained, None)
+            raises(ValueError, r"own\.safetensors describes no estimator of this version", load, file)
+        raises(ValueError, r"crossview: .* LearnedEightPoint.* LearnedNormalizer", load, "crossview")
+        raises(TypeError, "expected a name or a path of weights, got None", load, None)
 
     @siblings
     def test_starts_from_an_eight_point_estimator(self, kind):

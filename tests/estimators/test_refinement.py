@@ -296,13 +296,11 @@ WRONG_OF_ESSENTIAL = [
 
 def test_wrong_arguments():
     """Of the points, weights and matrices that refine_fundamental gets see test_contract.py."""
-    for refine, wrong, error, message in [
-        *((refine, *case) for refine in (refine_fundamental, refine_essential) for case in WRONG_OPTIONS),
-        *((refine_essential, *case) for case in WRONG_OF_ESSENTIAL),
-    ]:
-        start = {"F_mat": EYE.repeat(2, 1, 1)} if refine is refine_fundamental else {"E_mat": EYE.repeat(2, 1, 1)}
-        cameras = {} if refine is refine_fundamental else {"K1": EYE, "K2": EYE}
-        raises(error, message, refine, **{"points1": POINTS, "points2": POINTS, **start, **cameras} | wrong)
+    given = {"points1": POINTS, "points2": POINTS, "E_mat": EYE.repeat(2, 1, 1), "K1": EYE, "K2": EYE}
+    for wrong, error, message in WRONG_OPTIONS:
+        raises(error, message, refine_fundamental, POINTS, POINTS, EYE.repeat(2, 1, 1), **wrong)
+    for wrong, error, message in WRONG_OPTIONS + WRONG_OF_ESSENTIAL:
+        raises(error, message, refine_essential, **given | wrong)
 
 
 @pytest.mark.parametrize("num_points", [12, 40])

@@ -23,6 +23,8 @@ OF_SETS = {  # estimators, and how they are trained on sets of matches
     "pose": lambda: (kln.LearnedRelativePose(**SMALL, samples=4), {"loss": SetLoss(pose_weight=0.5), **FASTER}),
     "homography": lambda: (kln.LearnedHomography(**SMALL), {"loss": TRANSFER, **FASTER}),
 }
+STEPS = [("layer", True, 40, 0.05), ("layer", False, 100, 0.01), ("normaliser", True, 120, 0.02)]
+STEPS += [("pose", True, 180, 0.1), ("homography", True, 60, 0.05)]  # and the least decrease of the loss
 
 
 def set_task(kind="layer"):
@@ -54,13 +56,7 @@ def test_samples_lower_the_loss(tmp_path, precision):
     assert task.compute_loss(batch).item() < before - 0.02
 
 
-@pytest.mark.parametrize(
-    ("kind", "labels", "steps", "least"),
-    [
-        *(("layer", True, 40, 0.05), ("layer", False, 100, 0.01), ("normaliser", True, 120, 0.02)),
-        *(("pose", True, 180, 0.1), ("homography", True, 60, 0.05)),
-    ],
-)
+@pytest.mark.parametrize(("kind", "labels", "steps", "least"), STEPS)
 def test_sets_lower_the_loss(kind, labels, steps, least, tmp_path):
     matches = random_planes if kind == "homography" else random_matches
     task, data = set_task(kind), make_sets(labels, matches)
@@ -81,6 +77,13 @@ def test_what_cannot_be_trained_on(tmp_path):
     assert [set_task(kind)._finite(sets)[1] for kind in ("layer", "pose")] == [0, 1]
     (median := Median()).update(torch.zeros(0))  # all sets left out
     assert median.compute().isnan()
+    for layer, kind in ((kln.Hartley(), "LearnedLayer"), (kln.EightPoint(), "LearnedNormalizer")):
+        raises(TypeError, f"expected a {kind} .*, got Hartley", EstimatorTask, layer)
+    endless = make_trainer(tmp_path, max_steps=-1, max_time="00:00:01:00", limit_val_batches=0)
+    raises(ValueError, r"give trainer.max_steps or trainer.max_epochs", endless.fit, set_task(), make_sets())
+    empty = make_trainer(tmp_path, [ExportWeights()], max_steps=3, limit_train_batches=0)
+    raises(ValueError, "ended before its first step", empty.fit, normaliser_task(), make_data())
+    assert not (tmp_path / "weights.safetensors").exists()
 
 
 def test_betas_of_your_own_stay(tmp_path):
@@ -183,19 +186,3 @@ def test_every_number_of_steps_has_a_schedule(tmp_path, steps):
     trainer = make_trainer(tmp_path, max_steps=steps, limit_val_batches=0, enable_checkpointing=False)
     trainer.fit(set_task(), make_sets(correspondences=32))
     assert trainer.global_step == steps
-
-
-def test_a_training_without_an_end_has_no_cycle(tmp_path):
-    trainer = make_trainer(tmp_path, max_steps=-1, max_time="00:00:01:00", limit_val_batches=0)
-    raises(ValueError, r"give trainer.max_steps or trainer.max_epochs", trainer.fit, set_task(), make_sets())
-
-
-@pytest.mark.parametrize(("layer", "kind"), [(kln.Hartley(), "LearnedLayer"), (kln.EightPoint(), "LearnedNormalizer")])
-def test_estimators_that_learn_nothing_are_refused(layer, kind):
-    raises(TypeError, f"expected a {kind} .*, got Hartley", EstimatorTask, layer)
-
-
-def test_untrained_weights_are_not_written(tmp_path):
-    trainer = make_trainer(tmp_path, [ExportWeights()], max_steps=3, limit_train_batches=0)
-    raises(ValueError, "ended before its first step", trainer.fit, normaliser_task(), make_data())
-    assert not (tmp_path / "weights.safetensors").exists()

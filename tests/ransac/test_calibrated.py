@@ -39,18 +39,13 @@ def estimate(points, cameras, weights=None, **options):
     return RANSAC(seed=0, **options).estimate(*points, weights, *cameras)
 
 
-def test_weights():
+def test_weights_and_cameras_save_samples():
     points, cameras, E, true = pair(outliers=0.7, seed=1)
     found = estimate(points, cameras, 0.1 + true + 0.5 * uniform(200))
     assert found.num_samples < estimate(points, cameras).num_samples
     assert up_to_sign(found.E_mat[None], E[None]) < 0.02
-
-
-def test_cameras_need_less_confidence_by_default():
-    points, cameras, _, _ = pair(outliers=0.7, seed=1)
-    estimates = (RANSAC(seed=0, confidence=c).estimate(*points, None, *cameras) for c in (None, 0.999, 0.999999))
-    usual, same, more = (found.num_samples for found in estimates)
-    assert usual == same < more
+    usual, same, more = (estimate(points, cameras, confidence=c).num_samples for c in (None, 0.999, 0.999999))
+    assert usual == same < more  # with cameras, less confidence is needed by default
 
 
 def test_failure():

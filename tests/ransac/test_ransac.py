@@ -212,19 +212,15 @@ class TestBudget:
 
 
 class TestHardInput:
-    @pytest.mark.parametrize(
-        "arguments",
-        [
+    @pytest.mark.parametrize("normalizer", [None, kln.Whitening()])
+    def test_what_determines_no_matrix(self, normalizer):
+        for arguments in [
             pair(num_points=8, outliers=0.0)[:2],
             (LINE, LINE + 3),
             (torch.cat([POINTS[:7], POINTS[7:] * NAN]), uniform(20, 2, seed=1)),
             (POINTS, uniform(20, 2, seed=1), (torch.arange(20) < 7).float()),
-        ],
-        ids=["eight", "on a line", "seven finite rows", "seven weights"],
-    )
-    @pytest.mark.parametrize("normalizer", [None, kln.Whitening()])
-    def test_what_determines_no_matrix(self, arguments, normalizer):
-        assert failed(RANSAC(seed=0, normalizer=normalizer, max_samples=2000)(*arguments))
+        ]:
+            assert failed(RANSAC(seed=0, normalizer=normalizer, max_samples=2000)(*arguments))
 
     @pytest.mark.parametrize("value", [None, 0.0, 5.0, 1e6])
     def test_all_outliers_or_all_identical(self, value):
