@@ -248,7 +248,7 @@ class RANSAC(nn.Module):
         scorer = PairScorer(x1, x2, self.inl_th, self.model, scored)
         scorer = scorer if cameras is None else scorer.of_cameras(*cameras)
         pool, drawn = self._search(scorer, sampler, generator)
-        if self.refine and isinstance(scorer.model, Fundamental) and not isinstance(scorer.model, Essential):
+        if self.refine and type(scorer.model) is Fundamental:  # not a model of essential matrices, or of one's own
             pool = try_dominant_plane(scorer, pool, generator)
         if len(pool.F_mat) == 0:
             return _failure(points1, drawn, cameras)
